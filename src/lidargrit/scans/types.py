@@ -120,11 +120,9 @@ class Scan:
         if self.filled is None or bool(self.filled.all()):
             return self
         kept = ~self.filled
-        points, reflectance, ring, label = (
-            None if each is None else each[kept] for each in (self.points_xyz_m, self.reflectance, self.ring, self.label)
-        )
-        assert points is not None
-        return Scan(points, reflectance, ring, label, self.source, self.full_scale, self.notes)
+        parts = (self.reflectance, self.ring, self.label)
+        reflectance, ring, label = (None if each is None else each[kept] for each in parts)
+        return Scan(self.points_xyz_m[kept], reflectance, ring, label, self.source, self.full_scale, self.notes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,6 +79,11 @@ class ScanFormat(ABC):
         """Return whether scans can be written in it."""
         return bool({"write", "write_columns"} & cls.__dict__.keys())
 
+    @classmethod
+    def writes_columns(cls) -> bool:
+        """Return whether named columns of any points can be written in it."""
+        return "write_columns" in cls.__dict__
+
     @staticmethod
     @abstractmethod
     def recognises(path: Path) -> bool:

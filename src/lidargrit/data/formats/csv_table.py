@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from io import BytesIO
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np

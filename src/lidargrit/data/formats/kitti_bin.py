@@ -78,7 +78,7 @@ class KittiBin(ScanFormat):
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
         """Return coordinates and reflectance, 0 if the scan has none."""
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
-        return columns_by_name(_COLUMNS, torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1))
+        return columns_by_name(_COLUMNS, torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1), scan.filled)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

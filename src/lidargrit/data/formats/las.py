@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import struct
 import warnings
+from collections.abc import Mapping
 from datetime import date
 from io import BytesIO
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 

@@ -100,7 +100,7 @@ class NuscenesBin(ScanFormat):
         x, y, z = scan.points_xyz_m.unbind(1)
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
         rows = torch.stack((-y, x, z, (255 * reflectance).round(), (_LASERS - 1 - scan.ring).float()), dim=1)
-        return columns_by_name(_COLUMNS, rows)
+        return columns_by_name(_COLUMNS, rows, scan.filled)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

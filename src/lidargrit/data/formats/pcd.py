@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np

@@ -76,7 +76,7 @@ class XyzBin(ScanFormat):
         if farthest_m > _FARTHEST_M:
             what = f"a coordinate of {farthest_m:g} m in {scan.source}, to write as {cls.title}"
             raise OutputError(what, f"at most {_FARTHEST_M:g} m", "choose another format, such as ply")
-        return columns_by_name(_COLUMNS, scan.points_xyz_m)
+        return columns_by_name(_COLUMNS, scan.points_xyz_m, scan.filled)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

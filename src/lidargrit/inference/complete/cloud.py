@@ -1,4 +1,4 @@
-"""A cloud and what a model made of its images → the whole cloud: measured points as they are, filled ones behind them."""
+"""A cloud and what a model made of its images → the whole cloud: measured points as they are, then filled ones."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from lidargrit.inference.complete.grid import RayGrid
@@ -60,11 +60,11 @@ class CompletedScan:
         """Return for each added point which point of the scan that stays lies nearest to its ray."""
         assert self.filled is not None
         stays = np.flatnonzero(self.kept.numpy())
-        tree = cKDTree(_directions(self.scan.points_xyz_m[self.kept]))
+        tree = KDTree(_directions(self.scan.points_xyz_m[self.kept]))
         return stays[tree.query(_directions(self.filled.points_xyz_m))[1]]
 
 
-def filled_scan(seen: InputScan, grid: RayGrid, condition: Condition, images: RangeImage, hides: bool) -> CompletedScan:
+def filled_scan(seen: InputScan, condition: Condition, images: RangeImage, hides: bool) -> CompletedScan:
     """Return a scan with a point on every ray that lacked one and returns by the model.
 
     A ray on which a point was measured keeps that alone. An added point has the range that the model gives, in the
@@ -72,12 +72,12 @@ def filled_scan(seen: InputScan, grid: RayGrid, condition: Condition, images: Ra
     apart than two columns of the model, it lies between them.
 
     Args:
-        seen: scan on the rays of the grid.
-        grid: images of the model that the grid consists of.
-        condition: what was observed, for each of these images.
+        seen: scan on its rays, which are several images of the model.
+        condition: what was observed of each of these images.
         images: what the model made of each.
         hides: whether measured points outside the observed pixels are left out.
     """
+    grid = seen.rays
     completed, observed = grid.joined(images), _on_grid(condition.return_observed, grid)
     scan, taken = seen.cloud, seen.taken()
     kept = torch.ones(len(scan), dtype=torch.bool)
@@ -98,22 +98,23 @@ def filled_scan(seen: InputScan, grid: RayGrid, condition: Condition, images: Ra
     return CompletedScan(_with_rows(seen), kept, replace(filled, ring=_rings_of_added(seen, filled)))
 
 
-def dropped_scan(seen: InputScan, grid: RayGrid, condition: Condition, images: RangeImage) -> CompletedScan:
+def dropped_scan(seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
     """Return a scan without the points that do not return by the model.
 
     All points of a pixel share its decision. Points without a pixel, above or below all rows or beyond the limits of
     range, follow the nearest ray by angle that has one. If the model writes reflectance, it takes the place of theirs.
 
     Args:
-        seen, grid, condition, images: arguments of :func:`filled_scan`.
+        seen, condition, images: arguments of :func:`filled_scan`.
     """
+    grid = seen.rays
     completed, surface = grid.joined(images), _on_grid(condition.range_observed, grid)
     scan, pixels = seen.cloud, seen.coordinates
     row, column = pixels.row.clip(0, grid.sensor.height - 1).astype(np.int64), pixels.column.astype(np.int64)
     decided = pixels.in_rows() & surface.numpy()[row, column]
     rows, columns = np.nonzero(surface.numpy())
     rays = grid.sensor.ray_directions()[rows, columns].double().numpy()
-    nearest = cKDTree(rays).query(_directions(scan.points_xyz_m)[~decided])[1]
+    nearest = KDTree(rays).query(_directions(scan.points_xyz_m)[~decided])[1]
     row[~decided], column[~decided] = rows[nearest], columns[nearest]
     if completed.reflectance is not None:
         scan = replace(scan, reflectance=completed.reflectance[row, column], rows=None)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Int
+from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
@@ -44,7 +45,7 @@ class RayGrid:
 
         Args:
             model: sensor of the model.
-            columns: number of columns in which the cloud's sensor fires; 0 where it is not known: the model's fine ones.
+            columns: number of columns in which the cloud's sensor fires; the model's fine ones where it is 0, unknown.
             first_edge_rad: azimuth at which the first of these columns begins; that of the model if not given.
         """
         if model.elevation_rad.shape[1] > 1 or model.azimuth_rad.shape[0] > 1:  # angles for every pixel: no others
@@ -59,18 +60,22 @@ class RayGrid:
 
     def images(self, image: RangeImage) -> RangeImage:
         """Return one image (H, columns) of the grid as a batch of images of the model."""
-        parts = [image.mapped(lambda pixels, at=at: pixels[:, at :: self.phases]) for at in range(self.phases)]
-        return RangeImage.stack(parts)
+        size = (self.model.height, self.model.width, self.phases)
+        return _of_other_size(image, self.model, lambda pixels: pixels.reshape(size).movedim(-1, 0).contiguous())
 
     def joined(self, images: RangeImage) -> RangeImage:
         """Return a batch of images of the model, one for each phase, as one image of the grid."""
         size = (self.sensor.height, self.sensor.width)
-        whole = images.mapped(lambda pixels: pixels.movedim(0, -1).reshape(size))
-        return replace(whole, sensor=self.sensor)
+        return _of_other_size(images, self.sensor, lambda pixels: pixels.movedim(0, -1).reshape(size))
 
     def seeds(self, *parts: int) -> list[int]:
         """Return a seed for each image; that of the first is the seed of the model's image alone."""
         return [scan_seed(*parts, at) if at else scan_seed(*parts) for at in range(self.phases)]
+
+
+def _of_other_size(images: RangeImage, sensor: SensorModel, change: Callable[[Tensor], Tensor]) -> RangeImage:
+    reflectance, label = (None if pixels is None else change(pixels) for pixels in (images.reflectance, images.label))
+    return RangeImage(change(images.range_m), change(images.return_mask), sensor, reflectance, label)
 
 
 def phase_seed(seed: int, phase: int) -> int:

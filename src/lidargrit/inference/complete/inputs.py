@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
+from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
 from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
@@ -42,6 +43,7 @@ class InputScan:
         doubt: sign that another sensor than the named one made the scan, for a person; "" if there is none.
         pixels: row, column and range of every point; None where it was an image.
         by_ring: whether rows are rings.
+        grid: rays of the image, as images of a model; None for the image alone.
     """
 
     image: RangeImage
@@ -51,6 +53,12 @@ class InputScan:
     doubt: str = ""
     pixels: PixelCoordinates | None = None
     by_ring: bool = False
+    grid: RayGrid | None = None
+
+    @property
+    def rays(self) -> RayGrid:
+        """Rays of the image, as images of a model."""
+        return self.grid or RayGrid(self.image.sensor, self.image.sensor)
 
     @classmethod
     def of_image(cls, image: RangeImage) -> InputScan:
@@ -122,17 +130,23 @@ class Inputs:
         path = self._scans.path(index)
         return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
-    def read(self, index: int) -> InputScan:
-        """Read one scan; tell once how many of its points have a pixel, and if another sensor seems to have made it.
+    def read(self, index: int, see: Callable[[Scan], InputScan] | None = None) -> InputScan:
+        """Read one scan; tell once if another sensor seems to have made it, and how many points have no pixel.
+
+        Args:
+            index: index of the scan.
+            see: what brings a cloud to the rays that all of its points lie on; not given, it becomes one image of the
+                reader's sensor. A range image stays as it is.
 
         Raises:
             ScanError: a scan that cannot be used, or of another sensor.
         """
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
-        scan = self._reader.read(self._scans.scan(index))
-        if not self._counted and scan.points is not None:
-            self._tell_points(scan.image, len(scan.points))
+        points = self._scans.scan(index)
+        scan = self._reader.read(points) if see is None else see(points)
+        if not self._counted and see is None:
+            self._tell_points(scan.image, len(points))
         if scan.doubt and not self._doubted:
             self._reporter.message(f"WARNING: {scan.doubt}")
             self._doubted = True

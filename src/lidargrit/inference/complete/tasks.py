@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -38,17 +38,30 @@ class Task(ABC):
         """Return the rays of a whole cloud."""
         return RayGrid.fitting(model, columns_fired(scan, model))
 
+    def see(self, scan: Scan, model: Model) -> InputScan:
+        """Return a cloud on the rays that all of its points lie on.
+
+        Raises:
+            ScanError: a scan that cannot be used, or of another sensor.
+        """
+        grid = self.grid(scan, model.sensor)
+        return replace(self.reader(grid.sensor, model.projection_variant).read(scan), grid=grid)
+
     @abstractmethod
-    def condition(self, seen: InputScan, grid: RayGrid, seed: int) -> Condition:
-        """Return what is known of each image of a grid, the random part of it by a seed.
+    def condition(self, seen: InputScan, seed: int) -> Condition:
+        """Return what is known of each image that a scan consists of, the random part of it by a seed.
 
         Raises:
             ScanError, UsageError: a scan of which nothing or everything is known.
         """
 
     @abstractmethod
-    def result(self, seen: InputScan, grid: RayGrid, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
         """Return the cloud with what the model made of its images."""
+
+    def sensor_of_points(self, seen: InputScan) -> SensorModel:
+        """Return the rays of the completed cloud, with the projection by which its points get their rows."""
+        return replace(seen.rays.sensor, projection="unfolding" if seen.by_ring else "spherical")
 
     def identity(self) -> dict[str, Any]:
         """Return the settings of the task as JSON, by which its files are told from those of others."""
@@ -63,22 +76,22 @@ class Fill(Task):
         pattern: choice of the observed pixels.
     """
 
-    pattern: Pattern = Pattern("returns")
+    pattern: Pattern
     verb: ClassVar[str] = "complete"
 
     def reader(self, sensor: SensorModel, variant: ProjectionVariant) -> ScanReader:
         """Return one that takes a part of the circle where only returns are observed."""
         return ScanReader(sensor, variant, self.pattern.partial)
 
-    def condition(self, seen: InputScan, grid: RayGrid, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Condition:
         """Return the pixels that the pattern observes."""
-        images = grid.images(seen.image)
+        images = seen.rays.images(seen.image)
         source = "a range image" if seen.points is None else seen.points.source
         return Condition.of_pixels(images, self.pattern.masks(images, seed, source))
 
-    def result(self, seen: InputScan, grid: RayGrid, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
         """Return the measured points with those that were added; those that the pattern hides are left out."""
-        return filled_scan(seen, grid, condition, images, hides=not self.pattern.partial)
+        return filled_scan(seen, condition, images, hides=not self.pattern.partial)
 
     def identity(self) -> dict[str, Any]:
         """Return the pattern."""
@@ -109,15 +122,25 @@ class AddRows(Task):
         fine = self.scans_sensor.width * self.scans_sensor.column_stride
         return RayGrid.fitting(model, fine, self.scans_sensor.first_edge_rad)
 
-    def condition(self, seen: InputScan, grid: RayGrid, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Condition:
         """Return all rays of the rows that the scan has, with a return or without."""
-        rows = observed_rows(seen)
-        masks = torch.stack([rows[:, at :: grid.phases] for at in range(grid.phases)])
-        return Condition.of_pixels(grid.images(seen.image), masks)
+        rows, phases = observed_rows(seen), seen.rays.phases
+        masks = torch.stack([rows[:, at::phases] for at in range(phases)])
+        return Condition.of_pixels(seen.rays.images(seen.image), masks)
 
-    def result(self, seen: InputScan, grid: RayGrid, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
         """Return all measured points with those of the added rows."""
-        return filled_scan(seen, grid, condition, images, hides=False)
+        return filled_scan(seen, condition, images, hides=False)
+
+    def sensor_of_points(self, seen: InputScan) -> SensorModel:
+        """Return the dense rows, with those of the scans' sensor that look above or below them all."""
+        dense, own = seen.rays.sensor, self.scans_sensor
+        elevation_rad, own_rad = dense.elevation_rad.mean(1), own.elevation_rad.mean(1)
+        step_rad = float(-elevation_rad.diff().mean())
+        beyond = (own_rad > elevation_rad[0] + step_rad / 2) | (own_rad < elevation_rad[-1] - step_rad / 2)
+        rows_rad = torch.cat((elevation_rad, own_rad[beyond])).sort(descending=True).values[:, None]
+        rows = {"elevation_rad": rows_rad, "azimuth_offset_rad": None}
+        return replace(dense, name=f"{own.name}_upsampled", projection="spherical", **rows)
 
     def identity(self) -> dict[str, Any]:
         """Return the sensor of the scans."""
@@ -136,13 +159,13 @@ class Drop(Task):
         """Return one of whole scans."""
         return ScanReader(sensor, variant)
 
-    def condition(self, seen: InputScan, grid: RayGrid, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Condition:
         """Return the ranges of all surfaces."""
-        return Condition.of_surfaces(grid.images(seen.image))
+        return Condition.of_surfaces(seen.rays.images(seen.image))
 
-    def result(self, seen: InputScan, grid: RayGrid, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
         """Return the points that return."""
-        return dropped_scan(seen, grid, condition, images)
+        return dropped_scan(seen, condition, images)
 
 
 def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int = 0) -> CompletedScan:
@@ -170,11 +193,10 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
         >>> bool((whole.points_xyz_m[: len(scan)] == scan.points_xyz_m).all())
         True
     """
-    task = task or Fill()
-    grid = task.grid(scan, model.sensor)
-    seen = task.reader(grid.sensor, model.projection_variant).read(scan)
-    condition = task.condition(seen, grid, derive_seed(seed))
-    return task.result(seen, grid, condition, complete_images(model, condition, grid.seeds(seed)))
+    task = task or Fill(Pattern("returns"))
+    seen = task.see(scan, model)
+    condition = task.condition(seen, derive_seed(seed))
+    return task.result(seen, condition, complete_images(model, condition, seen.rays.seeds(seed)))
 
 
 def complete_images(model: Model, condition: Condition, seeds: list[int]) -> RangeImage:
@@ -182,6 +204,8 @@ def complete_images(model: Model, condition: Condition, seeds: list[int]) -> Ran
     known = condition.range_observed.flatten(1).any(1)
     if bool(known.all()):
         return model.complete(condition, seeds)
+    if not bool(known.any()):
+        return condition.images
     some = known.nonzero()[:, 0].tolist()
     done = model.complete(condition[some], [seeds[at] for at in some])
     place = torch.zeros(len(known), dtype=torch.int64)

@@ -84,6 +84,7 @@ def projection_that_fits(scan: Scan, sensor: SensorModel) -> ProjectionName:
     generated, simulated and shuffled clouds. A file whose rings are in order but too many or too few keeps the sensor's
     projection, which refuses it: it was cut, or is of another sensor.
     """
+    scan = scan.measured()  # others were added in another order
     if sensor.projection == "spherical" or scan.ring is not None or len(scan) < _POINTS_FOR_ORDER:
         return sensor.projection
     ring = _rings_in_order(scan)
@@ -98,6 +99,7 @@ def has_few_rings(scan: Scan, sensor: SensorModel) -> bool:
 
     The upper rings alone, of points in firing order, are a file that was cut off.
     """
+    scan = scan.measured()
     if not 1 < ring_count(scan) <= sensor.height // 2:
         return False
     if scan.ring is not None:
@@ -112,6 +114,8 @@ def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -
 
     The image of such a scan is not wrong, point by point, but its rows are not those of the lasers.
     """
+    if scan.filled is not None:  # a model's rays lie between those of the sensor
+        return ""
     pixels = pixel_coordinates(scan, sensor, method, "exact")
     kept = np.flatnonzero(pixels.in_rows() & within_limits(pixels.range_m, sensor))
     if len(kept) < _POINTS_FOR_ORDER:
@@ -196,6 +200,7 @@ def closest_sensor(scan: Scan) -> str:
 
 def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[str, float] | None:
     """Return how far rings lie from the rows of each sensor with as many, in the mean; None where rings are unknown."""
+    scan = scan.measured()
     ring = _rings_in_order(scan) if scan.ring is None else scan.ring.numpy()
     if ring is None or int(ring.min()) < 0:
         return None
@@ -211,6 +216,7 @@ def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[
 
 def ring_count(scan: Scan) -> int:
     """Count the rings of a scan by its highest ring index, or by its firing order if it names no rings."""
+    scan = scan.measured()
     if scan.ring is not None:
         return int(scan.ring.max()) + 1
     return int(unfolding.rings_from_firing_order(scan.points_xyz_m.numpy().T)[-1]) + 1

@@ -41,9 +41,12 @@ def wide_row(values: Float32[np.ndarray, "n"]) -> int:
     return width if width > 4 else 0
 
 
-def columns_by_name(names: Sequence[str], rows: Float32[Tensor, "n w"]) -> dict[str, np.ndarray]:
-    """Return the numbers of every row by their names."""
-    return dict(zip(names, rows.numpy().T, strict=True))
+def columns_by_name(
+    names: Sequence[str], rows: Float32[Tensor, "n w"], filled: Bool[Tensor, "n"] | None = None
+) -> dict[str, np.ndarray]:
+    """Return the numbers of every row by their names, with marks of filled points where there are some."""
+    marks = {} if filled is None else {"filled": filled.numpy()}
+    return {**dict(zip(names, rows.numpy().T, strict=True)), **marks}
 
 
 def rows_of(names: Sequence[str], rows: Float32[Tensor, "N w"], kept: Bool[Tensor, "N"] | None = None) -> FileRows:

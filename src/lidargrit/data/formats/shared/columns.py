@@ -93,6 +93,13 @@ def known_name(name: str) -> str:
     return _plain(name) if _plain(name) in (*REFLECTANCE_NAMES, *_RING, *_LABEL, *_FILLED, *_TIME) else ""
 
 
+def quantity_of(name: str) -> str:
+    """Return what a column holds of a scan: x, y, z, reflectance, ring, label or filled; "" for something else."""
+    plain = _plain(name)
+    kinds = {"reflectance": REFLECTANCE_NAMES, "ring": _RING, "label": _LABEL, "filled": _FILLED}
+    return plain if plain in ("x", "y", "z") else next((kind for kind, names in kinds.items() if plain in names), "")
+
+
 def columns_of(scan: Scan) -> dict[str, np.ndarray]:
     """Return a scan's columns for a file: x, y, z and what it has of intensity, ring, label and filled."""
     columns = {axis: scan.points_xyz_m[:, column].numpy() for column, axis in enumerate("xyz")}
