@@ -269,8 +269,8 @@ def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, cap
     assert nearest["beside_triangulation_m"]["value"] == pytest.approx(difference)
     assert main([*words[:2], "nearest", "--observed", "returns", "--sensor", f"{folders}/sensor.json"]) == 2
     assert "got --observed returns, which hides no return of these scans" in capsys.readouterr().err
-    assert main([*words[:2], f"{folders}/run:completion=guess"]) == 2
-    assert "completion=guess" in capsys.readouterr().err
+    assert main([*words[:2], f"{folders}/run:mask=guess"]) == 2
+    assert "mask=guess" in capsys.readouterr().err
 
 
 def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):

@@ -85,6 +85,9 @@ def open_model(
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
     """
     if is_classical(word):
+        if kind != "pixels":
+            got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"
+            raise ConfigError(got, f"a run that takes {KINDS[kind]}", "name one, such as pretrained")
         if settings:
             raise ConfigError(f"--model {word} for --set {settings[0]}", "a run, such as pretrained", "name a run")
         if sensor is None:  # other verbs take that of the source
