@@ -21,7 +21,7 @@ def main(folder: Path, run: str = "pretrained") -> None:
     model = lidargrit.load(run)
     if not isinstance(model, LidarGrit) or not isinstance(model.pixels, PixelDecoder):
         raise ConfigError(f"{run}, which has no pixel decoder", "a run with one", "train the recipe compact_pixels")
-    scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
+    scan, plain = model.sample([SEED])[0], model.sample([SEED], sampling=TokenSampling(mask="bernoulli"))[0]
     phases = model.pixels.mask.phases
     panels = []
     for lattice, count in completed_lattices(phases)[-SHOWN:]:

@@ -110,7 +110,7 @@ def _train(
                 objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = recipe.data.workers, recipe.settings_of(stage)
-            return Fit(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
+            return Fit(objective, config, folder / stage, seed, reporter, built_on, workers, checked.told, picture)
 
         built_on = ""
         for number, stage in enumerate(generator.stages):

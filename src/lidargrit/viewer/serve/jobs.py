@@ -61,7 +61,7 @@ class JobQueue:
         self._folder, self._options = folder, {"runs": [str(run) for run in runs], "device": device}
         self._jobs: dict[str, Job] = {}  # the oldest first
         self._waiting: deque[Job] = deque()
-        self._changed = threading.Condition()
+        self._changed = threading.Observed()
         self._closed = False
         self._numbers = itertools.count()
         self._worker = WorkerProcess(self._options)
