@@ -11,7 +11,8 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.generation.presets import load_preset
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
@@ -201,11 +202,11 @@ def test_levels_steps_and_their_size_are_choices_and_are_counted():
     passes = []
     hook = generator.network.register_forward_hook(lambda *_: passes.append(1))
     settings = LangevinSampling(levels=3, steps_each=2, step_lr=1e-9)
-    first = generator.sample([0], settings)
+    first = generator.sample([0], sampling=settings)
     assert len(passes) == 7
     hook.remove()
     for other in ({"levels": 4}, {"steps_each": 3}, {"step_lr": 2e-9}):
-        assert not torch.equal(generator.sample([0], replace(settings, **other)).range_m, first.range_m)
+        assert not torch.equal(generator.sample([0], sampling=replace(settings, **other)).range_m, first.range_m)
     one, two = (generator.cost(LangevinSampling(levels=levels, steps_each=1)).flops for levels in (2, 5))
     assert one == two / 2 > 0
 
@@ -286,20 +287,20 @@ def test_a_completed_scan_keeps_what_was_observed_whichever_pixels_these_are():
     generator, images = made(), walls()
     sampling = LangevinSampling(levels=3, steps_each=2, step_lr=1e-9)
     observed = torch.rand(2, 64, 32, generator=torch.Generator().manual_seed(4)) < 0.3
-    done = generator.complete(Condition.of_pixels(images, observed), [0, 1], sampling)
+    done = generator.complete(Observed.of_pixels(images, observed), [0, 1], sampling)
     for name in ("range_m", "return_mask", "reflectance"):
         assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
     hidden = RangeImage.masked(
         torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.reflectance
     )
-    again = generator.complete(Condition.of_pixels(hidden, observed), [0, 1], sampling)
+    again = generator.complete(Observed.of_pixels(hidden, observed), [0, 1], sampling)
     assert torch.equal(again.range_m, done.range_m)
     # What the network sees of the observed pixels reaches the others.
     nothing = torch.zeros_like(observed)
-    free = generator.complete(Condition.of_pixels(images, nothing), [0, 1], sampling)
-    assert torch.equal(free.range_m, generator.sample([0, 1], sampling).range_m)
+    free = generator.complete(Observed.of_pixels(images, nothing), [0, 1], sampling)
+    assert torch.equal(free.range_m, generator.sample([0, 1], sampling=sampling).range_m)
     assert not torch.equal(done.range_m[~observed], free.range_m[~observed])
-    weaker = generator.complete(Condition.of_pixels(images, observed), [0, 1], replace(sampling, pull=0.1))
+    weaker = generator.complete(Observed.of_pixels(images, observed), [0, 1], replace(sampling, pull=0.1))
     assert not torch.equal(weaker.range_m[~observed], done.range_m[~observed])
 
 
@@ -314,7 +315,7 @@ def test_an_image_is_learned_by_heart():
     objective, losses = generator.objective("score").train(), []
     optimiser = torch.optim.Adam(objective.parameters(), lr=4e-3)
     for step in range(40):
-        terms = objective(images, torch.Generator().manual_seed(step))
+        terms = objective(Example(images), torch.Generator().manual_seed(step))
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()
