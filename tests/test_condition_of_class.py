@@ -26,9 +26,10 @@ FIT = TrainingConfig(8 * 6, 4, 0.1, validate_every=8, validation_scans=2, checkp
 @pytest.fixture(autouse=True)
 def toys(monkeypatch):
     """Add the toy to the generators and to what scans tell."""
-    find, file = discovery._files, {"toy_of_class": (Path(toy_of_class.__file__), "toy_of_class")}
+    toy = discovery._Place(Path(toy_of_class.__file__), "toy_of_class")
+    find, file = discovery._places, {"toy_of_class": toy}
     kinds = ("generators", "conditions")
-    monkeypatch.setattr(discovery, "_files", lambda kind: {**find(kind), **(file if kind in kinds else {})})
+    monkeypatch.setattr(discovery, "_places", lambda kind: {**find(kind), **(file if kind in kinds else {})})
 
 
 def preset(generator: str = "toy_of_class", condition: str = "toy_of_class") -> Preset:

@@ -173,7 +173,7 @@ def test_the_penalty_is_the_squared_gradient_at_real_images(images):
     step = 1e-5 * torch.eye(real.numel(), dtype=torch.float64).view(-1, 1, *real.shape[-2:])
     with torch.no_grad():
         slopes = torch.cat([(judge(real + part) - judge(real - part)) / 2e-5 for part in step.split(256)])
-    one = game_of(penalty_weight=3.0, penalty_every=1)(images[:1], rng(), "discriminator")["squared_gradient"]
+    one = game_of(penalty_weight=3.0, penalty_every=1)(Example(images[:1]), rng(), "discriminator")["squared_gradient"]
     assert float(one.detach()) == pytest.approx(float(slopes.square().sum()), rel=1e-4)
     assert game.turns == 2
     game.eval()(Example(images), rng(), "discriminator")  # no penalty, so that it can be validated without gradients
@@ -195,7 +195,7 @@ def test_each_player_moves_by_its_own_loss_against_the_other_as_it_stands(images
         total = 0.0
         for phase, optimiser in optimisers.items():
             slow.zero_grad()
-            loss = slow(images, torch.Generator().manual_seed(seed), phase)["loss"]
+            loss = slow(Example(images), torch.Generator().manual_seed(seed), phase)["loss"]
             loss.backward()
             optimiser.step()
             total += float(loss.detach())

@@ -178,7 +178,7 @@ def test_seeds_without_an_order_are_refused(name):
     for seeds, kind in (({3, 4}, "set"), ({3: 4}.keys(), "dict_keys"), (3, "int"), (iter([3]), "list_iterator")):
         with pytest.raises(ConfigError, match=rf"^got seeds of type {kind}; wanted a sequence, such as \[0\]; "):
             generator.sample(seeds, sampling=sampling)
-    assert same(generator.sample(np.array([3]), sampling), sampled_together(name)[:1])
+    assert same(generator.sample(np.array([3]), sampling=sampling), sampled_together(name)[:1])
 
 
 @pytest.mark.usefixtures("untyped")

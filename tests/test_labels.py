@@ -207,7 +207,7 @@ def test_raydrop_learns_what_a_class_does():
         optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
         for step in range(8):
             shuffled = marked.mapped(lambda pixels, by=step: pixels.roll(8 * by, -2))  # rows tell nothing
-            loss = objective(shuffled, torch.Generator().manual_seed(step))["loss"]
+            loss = objective(Example(shuffled), torch.Generator().manual_seed(step))["loss"]
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

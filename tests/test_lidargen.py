@@ -1,7 +1,6 @@
 """LiDARGen: its network, loss and sampler against the program's numbers, its checkpoints, raydrop, completion."""
 
 import json
-import math
 from dataclasses import replace
 
 import pytest
@@ -101,8 +100,7 @@ def test_noise_levels_and_the_norm_are_the_programs(numbers):
     agree(sigma_table(50.0, 0.01, 232), numbers["sigmas_232"], 1e-6)
     agree(sigma_table(50.0, 0.01, 232) / torch.from_numpy(numbers["sigmas_232"]), torch.ones(232), 1e-6)
     agree(sigma_table(8.0, 0.05, 20), numbers["sigmas_20"], 1e-6)
-    norm = InstanceNormPlus(6)
-    norm.load_state_dict(seeded(numbers, "norm"))
+    (norm := InstanceNormPlus(6)).load_state_dict(seeded(numbers, "norm"))
     agree(norm(torch.from_numpy(numbers["norm_x"])).detach(), numbers["norm_y"])
 
 
@@ -249,7 +247,7 @@ def test_the_cost_of_a_pass_at_the_small_size_is_that_counted_in_the_program():
     [
         {"channels": 1},
         {"log2_scale": 0.0},
-        {"log2_scale": math.nan},
+        {"log2_scale": float("nan")},
         {"sigma_largest": 0.001},
         {"sigma_smallest": 0.0},
         {"levels": 1},
@@ -277,9 +275,10 @@ def test_images_that_cannot_be_halved_are_refused():
 def test_scans_without_reflectance_train_the_range_only():
     images = walls(reflectance=False)
     with pytest.raises(ConfigError, match=r"without reflectance.*model\.reflectance=false"):
-        made().objective("score")(images, torch.Generator().manual_seed(0))
+        made().objective("score")(Example(images), torch.Generator().manual_seed(0))
     generator = made(reflectance=False)
-    assert bool(generator.objective("score")(images, torch.Generator().manual_seed(0))["loss"].isfinite())
+    loss = generator.objective("score")(Example(images), torch.Generator().manual_seed(0))["loss"]
+    assert bool(loss.isfinite())
     assert generator.sample([0]).reflectance is None
 
 

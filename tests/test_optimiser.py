@@ -125,7 +125,7 @@ def test_the_loss_is_the_papers_sum(images, weight):
     torch.manual_seed(0)
     vqvae = Vqvae(model, images.sensor).eval()
     with torch.no_grad():
-        terms = vqvae(images, torch.Generator())
+        terms = vqvae(Example(images), torch.Generator())
         tokens = vqvae.encode(images)
         logits = vqvae.decode(tokens).return_logits
     log_likelihood = torch.where(images.return_mask, logits.sigmoid().log(), (1 - logits.sigmoid()).log())

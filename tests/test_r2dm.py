@@ -282,9 +282,9 @@ def test_calibrated_raydrop_returns_as_many_rays_as_the_training_scans():
 def test_scans_without_reflectance_train_the_range_only():
     images = walls(reflectance=False)
     with pytest.raises(ConfigError, match=r"without reflectance.*model\.reflectance=false"):
-        made().objective("diffusion")(images, torch.Generator().manual_seed(0))
+        made().objective("diffusion")(Example(images), torch.Generator().manual_seed(0))
     generator = made(reflectance=False)
-    assert bool(generator.objective("diffusion")(images, torch.Generator().manual_seed(0))["loss"].isfinite())
+    assert bool(generator.objective("diffusion")(Example(images), torch.Generator().manual_seed(0))["loss"].isfinite())
     assert generator.sample([0], sampling=DiffusionSampling(steps=2)).reflectance is None
 
 

@@ -211,7 +211,7 @@ def test_raydrop_learns_reflectance_from_marks():
     rng = torch.Generator().manual_seed(0)
     with torch.no_grad():
         found = objective.raydrop(images.range_m, images.return_mask).reflectance
-        terms = objective(marked, rng)
+        terms = objective(Example(marked), rng)
     errors = [float((found - images.reflectance)[scan][returned[scan]].abs().mean()) for scan in range(3)]
     assert float(terms["reflectance_error"]) == pytest.approx(sum(errors) / 3, rel=1e-4)
     learned = [terms["reflectance_error"] for terms in learn(objective.train(), marked, range(12), 1e-2)]

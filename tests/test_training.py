@@ -22,6 +22,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
@@ -303,7 +304,7 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
     vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     optimiser = make_optimiser(vqvae, TrainingConfig(scans=1, batch_size=1, learning_rate=1e-3))
     average = WeightAverage(vqvae, 1)
-    vqvae(images.batch([0]), torch.Generator())["loss"].backward()
+    vqvae(Example(images.batch([0])), torch.Generator())["loss"].backward()
     optimiser.step()
     held = [*vqvae.state_dict().values(), *average.objective.state_dict().values()]
     held += [parameter.grad for parameter in vqvae.parameters() if parameter.grad is not None]

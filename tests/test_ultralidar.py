@@ -89,7 +89,7 @@ def test_flips_mirror_the_voxels_of_some_scans():
     seen = []
     generator = made(replace(TINY, flips=True))
     generator.autoencoder.encoder.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
-    generator.objective("autoencoder")(images, torch.Generator().manual_seed(0))
+    generator.objective("autoencoder")(Example(images), torch.Generator().manual_seed(0))
     ways = [plain, plain.flip(-1), plain.flip(-2), plain.flip(-1, -2)]
     found = [[torch.equal(scan, way[index].float()) for way in ways] for index, scan in enumerate(seen[0])]
     assert all(any(one) for one in found)

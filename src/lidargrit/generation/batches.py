@@ -98,7 +98,7 @@ def check_images(images: RangeImage | Observed, sensor: SensorModel) -> None:
         )
 
 
-def check_observed_part(condition: Observed, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
+def check_observed(condition: Observed, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
     """Refuse observations of other rays, and those of a kind that a generator does not take.
 
     Args:

@@ -15,14 +15,7 @@ from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import WEIGHTS_FILE, Job, is_bundle, locate, named_folder
-from lidargrit.generation.batches import (
-    BatchSeeds,
-    check_images,
-    check_observed_part,
-    check_seeds,
-    in_batches,
-    one_by_one,
-)
+from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
 from lidargrit.generation.bundle import Bundle
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
 from lidargrit.generation.objective import Objective
@@ -154,8 +147,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
         Args:
             seeds: seeds, one for each scan, from 0 to 2^32 - 1.
-            condition: what is known of each scan, of a type in :attr:`takes`; ``Observed.of_pixels(images, observed)``
-                completes scans.
+            condition: condition of a type in :attr:`takes`, of as many scans as seeds;
+                ``Observed.of_pixels(images, observed)`` completes scans.
             sampling: settings of the generator's own ``Sampling``; its defaults if not given, and
                 :meth:`completion_sampling` for what was observed.
 
@@ -285,7 +278,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def _check_condition(self, condition: Condition) -> None:
         if isinstance(condition, Observed):
             self._require("complete")
-            check_observed_part(condition, self.conditions, self.sensor, self.public_name())
+            check_observed(condition, self.conditions, self.sensor, self.public_name())
         if type(condition) not in self.takes:
             kind, wanted = type(condition).__name__, ", ".join(sorted(one.__name__ for one in self.takes))
             got = "no condition" if isinstance(condition, Nothing) else f"a condition of type {kind}"

@@ -99,9 +99,9 @@ class Observed(Condition):
     label: Int[Tensor, "B H W"] | None = None
 
     def __post_init__(self) -> None:
-        check_observed(self.range_observed, self.range_m)
-        check_observed(self.return_observed, self.range_m)
-        check_observed(self.return_mask, self.range_m, "a mask of returns")
+        _check_mask(self.range_observed, self.range_m)
+        _check_mask(self.return_observed, self.range_m)
+        _check_mask(self.return_mask, self.range_m, "a mask of returns")
         object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
@@ -131,7 +131,7 @@ class Observed(Condition):
             images: batch of range images (B, H, W); pixels that were not observed have no influence.
             observed: True for observed pixels.
         """
-        check_observed(observed, images.range_m)
+        _check_mask(observed, images.range_m)
         returned = images.return_mask & observed
         range_m = torch.where(returned, images.range_m, 0.0)
         reflectance = None if images.reflectance is None else torch.where(returned, images.reflectance, 0.0)
@@ -147,7 +147,7 @@ class Observed(Condition):
             unknown: True for pixels of which nothing is known; none if not given.
         """
         unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
-        check_observed(unknown, clean.range_m, "unknown pixels")
+        _check_mask(unknown, clean.range_m, "unknown pixels")
         hit = clean.return_mask & ~unknown
         label = None if clean.label is None else torch.where(hit, clean.label, 0)
         return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)
@@ -238,7 +238,7 @@ class Observed(Condition):
         return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)
 
 
-def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
+def _check_mask(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
     """Refuse a mask whose shape is not that of the ranges, with ConfigError that says ``what`` it is."""
     if range_m.ndim != 3:
         raise ConfigError(f"ranges of shape {tuple(range_m.shape)}", "(B, H, W), a batch of images", "add a batch axis")

@@ -16,7 +16,7 @@ class Example:
 
     Args:
         images: batch of range images (B, H, W).
-        condition: what a generator is told of each image: as many, or nothing.
+        condition: condition of each image, as many as images; or nothing.
     """
 
     images: RangeImage

@@ -129,7 +129,7 @@ class CheckedStages:
     Args:
         objectives: objective of every stage, without values, by the name of the stage.
         donors: run from which a stage is taken as it is, by the name of the stage; the others are trained.
-        told: what the generator is told of each scan.
+        told: source of the condition that the generator is told of each scan.
     """
 
     objectives: Mapping[str, Objective]

@@ -48,7 +48,7 @@ class StageTraining:
         reporter: receiver of progress and messages.
         built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
         workers: number of threads that read ahead.
-        condition: what the generator is told of each scan.
+        condition: source of what the generator is told of each scan.
         plot: function that plots the averaged objective into a file; None for no pictures.
         deadline_s: value of ``time.monotonic()`` at which training stops as it does by SIGTERM.
     """
