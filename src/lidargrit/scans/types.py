@@ -7,16 +7,16 @@ tensors live inside one model.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Int64, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.sensors import SensorModel
 
 TYPICAL_LOG_RANGE = 2.5  # ln(1 + range in metres) in the middle of what scans hold: subtracted, inputs are near 0
@@ -24,19 +24,6 @@ CLASS_BITS = 0xFFFF  # of a label: its class; the bits above number the instance
 
 MaskDecoding = Literal["bernoulli", "threshold"]
 """How returns are decided from their probabilities: each at random, or wherever a return is likelier than none."""
-
-
-@dataclass(frozen=True, eq=False)
-class FileRows:
-    """What a file of points holds, row by row, also where a scan has no room for it or leaves the row out.
-
-    Args:
-        columns: values of every row (N), by the file's own names and in its own types.
-        of_point: row of every point of the scan (n).
-    """
-
-    columns: Mapping[str, Shaped[np.ndarray, "N"]]
-    of_point: Int64[np.ndarray, "n"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +200,7 @@ class RangeImage:
         return cls(
             join([image.range_m for image in images]),
             join([image.return_mask for image in images]),
-            images[0].sensor,
+            sensor_of_all([image.sensor for image in images]),
             join(reflectance) if len(reflectance) == len(images) else None,
             join(label) if len(label) == len(images) else None,
         )
@@ -238,6 +225,16 @@ class RangeImage:
             reflectance=None if self.reflectance is None else change(self.reflectance),
             label=None if self.label is None else change(self.label),
         )
+
+
+def sensor_of_all(sensors: Sequence[SensorModel]) -> SensorModel:
+    """Return the sensor of all images of a batch, or raise ConfigError where two have different rays."""
+    first = sensors[0]
+    for other in sensors:
+        if other is not first and not other.same_rays(first):
+            got = f"images of the sensors {first.name!r} and {other.name!r} in one batch"
+            raise ConfigError(got, "images of one sensor", "make a batch of each")
+    return first
 
 
 @dataclass(frozen=True, eq=False)

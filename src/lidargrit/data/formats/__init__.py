@@ -16,7 +16,8 @@ from torch import Tensor
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import OutputError, ScanError, first_words
-from lidargrit.scans.types import FileRows, Scan
+from lidargrit.scans.file_rows import FileRows
+from lidargrit.scans.types import Scan
 
 _CURES = {  # by the ending, for files that hold scans but are not read
     (

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.inference.complete.inputs import InputScan
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import along_rows
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.types import RangeImage, Scan
@@ -64,7 +64,7 @@ class CompletedScan:
         return stays[tree.query(_directions(self.filled.points_xyz_m))[1]]
 
 
-def filled_scan(seen: InputScan, condition: Condition, images: RangeImage, hides: bool) -> CompletedScan:
+def filled_scan(seen: InputScan, condition: Observed, images: RangeImage, hides: bool) -> CompletedScan:
     """Return a scan with a point on every ray that lacked one and returns by the model.
 
     A ray on which a point was measured keeps that alone. An added point has the range that the model gives, in the
@@ -98,7 +98,7 @@ def filled_scan(seen: InputScan, condition: Condition, images: RangeImage, hides
     return CompletedScan(_with_rows(seen), kept, replace(filled, ring=_rings_of_added(seen, filled)))
 
 
-def dropped_scan(seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
+def dropped_scan(seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
     """Return a scan without the points that do not return by the model.
 
     All points of a pixel share its decision. Points without a pixel, above or below all rows or beyond the limits of

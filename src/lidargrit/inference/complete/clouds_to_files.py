@@ -13,7 +13,8 @@ from lidargrit.data.export import IMAGE, TREE, writable_format, write_with_label
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.shared.columns import quantity_of
 from lidargrit.inference.complete.cloud import CompletedScan
-from lidargrit.scans.types import FileRows, Scan
+from lidargrit.scans.file_rows import FileRows
+from lidargrit.scans.types import Scan
 
 _AXES = ("x", "y", "z")
 _UNWRITABLE = ".npz"  # for range images, and for scans whose own format cannot be written

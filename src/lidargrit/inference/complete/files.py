@@ -26,7 +26,7 @@ from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.clouds_to_files import suffix_of, write_cloud
 from lidargrit.inference.complete.inputs import Inputs, InputScan
 from lidargrit.inference.complete.tasks import Task, complete_images
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
 
 _FILES_AT_MOST = 400_000  # as many as the largest data set has scans; the manifest names each
@@ -83,7 +83,7 @@ class _Job:
     number: int
     turn: int
     scan: InputScan
-    condition: Condition
+    condition: Observed
     form: type[ScanFormat] | None
 
 
@@ -228,7 +228,7 @@ def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
 def _completed(model: Model, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
     """Return what a model makes of each scan: a batch of the images that the scan consists of."""
     seeds = [one for job in jobs for one in job.scan.rays.seeds(seed + job.turn, job.number)]
-    images = complete_images(model, Condition.cat([job.condition for job in jobs]), seeds)
+    images = complete_images(model, Observed.cat([job.condition for job in jobs]), seeds)
     ends = list(accumulate(job.scan.rays.phases for job in jobs))
     return [images[end - job.scan.rays.phases : end] for job, end in zip(jobs, ends, strict=True)]
 
@@ -238,7 +238,7 @@ def _return_share(model: Model, job: _Job, output: OutputConfig) -> Float[Tensor
     total = torch.zeros(job.condition.return_mask.shape[1:])
     remaining = iter(range(output.probability))
     while turns := list(islice(remaining, model.generator.compute_batch)):
-        condition = Condition.cat([job.condition[:1]] * len(turns))
+        condition = Observed.cat([job.condition[:1]] * len(turns))
         seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += complete_images(model, condition, seeds).return_mask.float().sum(0)
     return total / output.probability

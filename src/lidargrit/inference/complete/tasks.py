@@ -15,7 +15,7 @@ from lidargrit.inference.complete.grid import RayGrid, columns_fired
 from lidargrit.inference.complete.inputs import InputScan, ScanReader
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.inference.complete.sparse import SparseReader, observed_rows
-from lidargrit.scans.condition import Condition, ConditionKind
+from lidargrit.scans.condition import ConditionKind, Observed
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
@@ -48,7 +48,7 @@ class Task(ABC):
         return replace(self.reader(grid.sensor, model.projection_variant).read(scan), grid=grid)
 
     @abstractmethod
-    def condition(self, seen: InputScan, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Observed:
         """Return what is known of each image that a scan consists of, the random part of it by a seed.
 
         Raises:
@@ -56,7 +56,7 @@ class Task(ABC):
         """
 
     @abstractmethod
-    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
         """Return the cloud with what the model made of its images."""
 
     def sensor_of_points(self, seen: InputScan) -> SensorModel:
@@ -83,13 +83,13 @@ class Fill(Task):
         """Return one that takes a part of the circle where only returns are observed."""
         return ScanReader(sensor, variant, self.pattern.partial)
 
-    def condition(self, seen: InputScan, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Observed:
         """Return the pixels that the pattern observes."""
         images = seen.rays.images(seen.image)
         source = "a range image" if seen.points is None else seen.points.source
-        return Condition.of_pixels(images, self.pattern.masks(images, seed, source))
+        return Observed.of_pixels(images, self.pattern.masks(images, seed, source))
 
-    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
         """Return the measured points with those that were added; those that the pattern hides are left out."""
         return filled_scan(seen, condition, images, hides=not self.pattern.partial)
 
@@ -122,13 +122,13 @@ class AddRows(Task):
         fine = self.scans_sensor.width * self.scans_sensor.column_stride
         return RayGrid.fitting(model, fine, self.scans_sensor.first_edge_rad)
 
-    def condition(self, seen: InputScan, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Observed:
         """Return all rays of the rows that the scan has, with a return or without."""
         rows, phases = observed_rows(seen), seen.rays.phases
         masks = torch.stack([rows[:, at::phases] for at in range(phases)])
-        return Condition.of_pixels(seen.rays.images(seen.image), masks)
+        return Observed.of_pixels(seen.rays.images(seen.image), masks)
 
-    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
         """Return all measured points with those of the added rows."""
         return filled_scan(seen, condition, images, hides=False)
 
@@ -159,11 +159,11 @@ class Drop(Task):
         """Return one of whole scans."""
         return ScanReader(sensor, variant)
 
-    def condition(self, seen: InputScan, seed: int) -> Condition:
+    def condition(self, seen: InputScan, seed: int) -> Observed:
         """Return the ranges of all surfaces."""
-        return Condition.of_surfaces(seen.rays.images(seen.image))
+        return Observed.of_surfaces(seen.rays.images(seen.image))
 
-    def result(self, seen: InputScan, condition: Condition, images: RangeImage) -> CompletedScan:
+    def result(self, seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
         """Return the points that return."""
         return dropped_scan(seen, condition, images)
 
@@ -199,7 +199,7 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
     return task.result(seen, condition, complete_images(model, condition, seen.rays.seeds(seed)))
 
 
-def complete_images(model: Model, condition: Condition, seeds: list[int]) -> RangeImage:
+def complete_images(model: Model, condition: Observed, seeds: list[int]) -> RangeImage:
     """Return what a model makes of images; one of which no range is known stays without a return."""
     known = condition.range_observed.flatten(1).any(1)
     if bool(known.all()):

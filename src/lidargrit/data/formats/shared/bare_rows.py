@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats.shared.filled import write_marks
-from lidargrit.scans.types import FileRows
+from lidargrit.scans.file_rows import FileRows
 
 _WIDTHS = range(3, 9)  # x, y, z to x, y, z, intensity, ring, time and two more
 _FEW_NUMBERS, _WIDTHS_OF_FEW = 1024, range(3, 6)  # fewer do not show wider rows

@@ -18,7 +18,8 @@ from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.data.formats import BadPoints, damaged, scan_of
 from lidargrit.data.formats.shared.labels import notes_on_labels
 from lidargrit.data.formats.shared.reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
-from lidargrit.scans.types import FileRows, Scan
+from lidargrit.scans.file_rows import FileRows
+from lidargrit.scans.types import Scan
 
 BYTES_AT_MOST = 256_000_000  # 4 million points of 64 bytes; sensors' own files have up to 48 a point
 REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that holds all values of a file; 8 bits: 255"
