@@ -1,0 +1,449 @@
+"""Whole clouds through complete, upsample and raydrop: nothing measured is lost or changed, and filled points are told."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.data import formats
+from lidargrit.data.formats import read_scan
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.formats.pcd import Pcd
+from lidargrit.data.prepared.config import ScanSettings
+from lidargrit.inference.complete import Model, open_model
+from lidargrit.inference.complete.cloud import _smoothed
+from lidargrit.inference.complete.grid import RayGrid, columns_fired
+from lidargrit.inference.complete.patterns import Pattern
+from lidargrit.inference.complete.sparse import SparseReader
+from lidargrit.inference.complete.tasks import AddRows, Drop, Fill, complete_scan
+from lidargrit.scans.fills import EDGE, along_rows
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.systems.completion.system import Completion
+from lidargrit.systems.raydrop.system import Raydrop
+from lidargrit.viewer.scan_sets import load_scan_sets
+
+DENSE = load_sensor("hdl64e_kitti_odometry").with_columns(128, 4)  # a model of 32 columns, of clouds with 128
+SIXTEEN = load_sensor("vlp16").with_columns(128)
+
+
+def street(sensor, seed: int = 0, share: float = 0.85) -> RangeImage:
+    """Return the ground and a wall around the sensor, with drops, and reflectance."""
+    elevation_rad = sensor.elevation_rad.expand(sensor.height, sensor.width)
+    wall_m = 12 + 4 * sensor.azimuth_rad.cos().expand_as(elevation_rad)
+    ground_m = torch.where(elevation_rad < -0.02, 1.7 / -elevation_rad.clamp(max=-0.02).sin(), 1e3)
+    rng = torch.Generator().manual_seed(seed)
+    returned = torch.rand(elevation_rad.shape, generator=rng) < share
+    bright = torch.rand(elevation_rad.shape, generator=rng)
+    return RangeImage.masked(torch.minimum(wall_m / elevation_rad.cos(), ground_m), returned, sensor, bright)
+
+
+def network(kind) -> Model:
+    torch.manual_seed(0)
+    generator = kind(kind.smallest_config(DENSE), DENSE).eval()
+    return Model("a network", generator, generator.completion_sampling())
+
+
+def is_kept(scan: Scan, whole: Scan, kept: torch.Tensor) -> bool:
+    """Return whether a cloud begins with the points of another that stay, bit for bit."""
+    count = int(kept.sum())
+    return all(
+        torch.equal(getattr(whole, name)[:count], getattr(scan, name)[kept])
+        for name in ("points_xyz_m", "reflectance", "ring")
+        if getattr(scan, name) is not None
+    )
+
+
+# The rays of a cloud.
+
+
+def test_every_column_of_a_cloud_is_in_one_image_of_the_model_and_comes_back():
+    grid = RayGrid.fitting(DENSE, 128)
+    assert (grid.phases, grid.sensor.width) == (4, 128)
+    image = street(grid.sensor)
+    images = grid.images(image)
+    assert images.range_m.shape == (4, 64, 32)
+    for column in range(128):
+        assert torch.equal(images.range_m[column % 4][:, column // 4], image.range_m[:, column])
+    back = grid.joined(images)
+    assert torch.equal(back.range_m, image.range_m)
+    assert torch.equal(back.reflectance, image.reflectance)
+    assert len(set(grid.seeds(7, 3))) == 4
+
+
+@pytest.mark.parametrize(("columns", "phases"), [(0, 4), (127, 4), (100, 3), (33, 1), (5, 1), (10**6, 32)])
+def test_a_grid_has_about_as_many_columns_as_the_cloud(columns, phases):
+    assert RayGrid.fitting(DENSE, columns).phases == phases
+
+
+def test_columns_are_counted_from_steps_of_azimuth_with_drops_and_two_returns_of_a_ray():
+    scan = unproject(street(DENSE.fine()))
+    twice = replace(
+        scan, **{name: torch.cat([getattr(scan, name)] * 2) for name in ("points_xyz_m", "reflectance", "ring")}
+    )
+    assert columns_fired(scan, DENSE) == columns_fired(twice, DENSE) == 128
+    few = Scan(scan.points_xyz_m[:10], ring=scan.ring[:10])
+    assert columns_fired(few, DENSE) == 0
+
+
+@pytest.mark.parametrize("wanted", ["os1_64", "os1_128", "pandar64", "hdl64e_kitti_360"])
+def test_no_measured_column_is_thrown_away_for_lying_half_a_column_off(wanted):
+    """Ouster's columns have their middles where those of a VLP-16 have borders: every nearest match was a tie."""
+    dense, own = load_sensor(wanted), load_sensor("vlp16").with_columns(load_sensor(wanted).width)
+    scan = unproject(RangeImage.masked(torch.full((16, own.width), 9.0), torch.ones(16, own.width).bool(), own))
+    seen = SparseReader(dense, source=load_sensor("vlp16")).read(scan)
+    columns = seen.on_grid.any(0)
+    assert bool(columns.all()), "its sensor fires in more columns than the dense one has"
+    rows = int(seen.on_grid.any(1).sum())
+    assert int((seen.point_of_pixel >= 0).sum()) > 0.99 * rows * dense.width - rows
+
+
+def test_fewer_columns_are_matched_as_a_slow_loop_does():
+    dense, own = load_sensor("os1_64"), load_sensor("vlp16").with_columns(500)
+    found = SparseReader(dense, source=own)._columns().tolist()
+    wanted_rad, own_rad = (one.azimuth_rad[0].double().tolist() for one in (dense, own))
+    width = 2 * math.pi / dense.width
+    for column, azimuth_rad in enumerate(wanted_rad):
+        inside = [
+            at for at, one in enumerate(own_rad) if abs(math.remainder(one - azimuth_rad, 2 * math.pi)) < width * 0.4999
+        ]
+        assert (found[column] in inside) if inside else True
+    taken = [one for one in found if one >= 0]
+    assert sorted(taken) == list(range(500)), "each is taken once"
+
+
+# One scan.
+
+
+@pytest.mark.parametrize("model", ["triangulation", "network"])
+def test_complete_keeps_every_point_and_fills_rays_without_one(model):
+    scan = unproject(street(DENSE.fine()))
+    scan = replace(scan, reflectance=scan.reflectance, ring=scan.ring)
+    chosen = open_model("triangulation", sensor=DENSE.fine()) if model == "triangulation" else network(Completion)
+    done = complete_scan(scan, chosen, seed=3)
+    whole = done.whole()
+    assert bool(done.kept.all())
+    assert is_kept(scan, whole, done.kept)
+    assert whole.filled.tolist() == [False] * len(scan) + [True] * len(done.filled)
+    assert len(done.filled) > 100
+    rays = done.filled.points_xyz_m / done.filled.points_xyz_m.norm(dim=1, keepdim=True)
+    of_grid = DENSE.fine().ray_directions()
+    missing = of_grid[~street(DENSE.fine()).return_mask]
+    apart = torch.cdist(rays.double(), missing.double()).min(1).values
+    assert float(apart.max()) < 1e-5, "on rays on which no point was measured"
+
+
+def test_the_first_image_of_a_cloud_is_what_the_model_makes_of_it_alone():
+    model, fine = network(Completion), street(DENSE.fine())
+    grid = RayGrid.fitting(DENSE, 128)
+    task = Fill(Pattern("rows:4"))
+    seen = task.see(unproject(fine), model)
+    alone = RangeImage(fine.range_m[:, ::4], fine.return_mask[:, ::4], DENSE, fine.reflectance[:, ::4])
+    condition = task.condition(seen, 0)
+    assert torch.equal(condition.images.range_m[0], alone.range_m * condition.return_observed[0])
+    assert grid.seeds(5)[0] == RayGrid(DENSE, DENSE).seeds(5)[0]
+
+
+def test_what_a_pattern_hides_is_left_out_and_filled():
+    scan = unproject(street(DENSE.fine()))
+    done = complete_scan(scan, network(Completion), Fill(Pattern("rows:4")))
+    assert torch.equal(done.kept, scan.ring % 4 == 2)
+    assert not bool((done.filled.ring % 4 == 2).any())
+
+
+def test_points_without_a_pixel_and_two_in_one_stay():
+    scan = unproject(street(DENSE.fine()))
+    sky = torch.tensor([[5.0, 1, 9], [0.2, 0.1, 0.01], [300, 0, -3]])  # above all rows, too near, too far
+    beside = scan.points_xyz_m[:2] * 1.5  # in the pixel of another
+    points = torch.cat((scan.points_xyz_m, sky, beside))
+    more = Scan(points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))])
+    done = complete_scan(more, open_model("nearest", sensor=DENSE.fine()))
+    assert torch.equal(done.whole().points_xyz_m[: len(more)], more.points_xyz_m)
+    too_far = done.filled.points_xyz_m / done.filled.points_xyz_m.norm(dim=1, keepdim=True)
+    assert float((too_far @ (sky[2] / sky[2].norm())).max()) < math.cos(0.01), "a ray with a point gets no other"
+
+
+def test_ten_points_come_back():
+    scan = unproject(street(DENSE.fine()))
+    ten = Scan(scan.points_xyz_m[::700][:10], scan.reflectance[::700][:10], scan.ring[::700][:10])
+    for model in (network(Completion), open_model("triangulation", sensor=DENSE.fine())):
+        whole = complete_scan(ten, model).whole()
+        assert torch.equal(whole.points_xyz_m[:10], ten.points_xyz_m)
+
+
+def test_each_dropped_point_follows_its_pixel_or_the_nearest_ray():
+    model, fine = network(Raydrop), street(DENSE.fine())
+    scan = unproject(fine)
+    outside = torch.tensor([[6.0, 1, 4], [3, -5, 4.5], [0.3, 0.2, 0.0], [190, 30, -4]])
+    scan = Scan(torch.cat((scan.points_xyz_m, outside, scan.points_xyz_m[:3] * 1.2)))
+    scan = Scan(scan.points_xyz_m[torch.randperm(len(scan), generator=torch.Generator().manual_seed(1))])
+    task = Drop()
+    seen = task.see(scan, model)
+    condition = task.condition(seen, 0)
+    images = model.complete(condition, seen.rays.seeds(0))
+    done = task.result(seen, condition, images)
+    assert 0 < int(done.kept.sum()) < len(scan)
+    returned = torch.zeros(64, 128, dtype=torch.bool)
+    for phase in range(4):
+        returned[:, phase::4] = images.return_mask[phase]
+    rows, columns = np.nonzero(seen.image.return_mask.numpy())
+    rays = seen.image.sensor.ray_directions().double().numpy()[rows, columns]
+    for point in range(len(scan)):
+        row, column = int(seen.pixels.row[point]), int(seen.pixels.column[point])
+        if not (0 <= row < 64 and bool(seen.image.return_mask[row, column])):
+            xyz = scan.points_xyz_m[point].double().numpy()
+            nearest = int((rays @ (xyz / np.linalg.norm(xyz))).argmax())
+            row, column = rows[nearest], columns[nearest]
+        assert bool(done.kept[point]) == bool(returned[row, column])
+
+
+def test_upsample_keeps_every_point_and_adds_rows_between():
+    scan = unproject(street(SIXTEEN))
+    dense = load_sensor("pandar64").with_columns(128)
+    done = complete_scan(scan, open_model("triangulation", sensor=dense), AddRows(SIXTEEN))
+    whole = done.whole()
+    assert bool(done.kept.all())
+    assert is_kept(scan, whole, done.kept)
+    x, y, z = done.filled.points_xyz_m.T
+    assert len((torch.atan2(z, torch.hypot(x, y)) * 1e3).round().unique()) > 30
+    own = SIXTEEN.elevation_rad[:, 0]
+    nearest = (torch.atan2(z, torch.hypot(x, y))[:, None] - own).abs().argmin(1)
+    assert float((done.filled.ring == nearest).float().mean()) > 0.99, "the laser that looks most nearly as high"
+    ground = done.filled.points_xyz_m[(z < -1) & (torch.hypot(x, y) < 8)]
+    assert float((ground[:, 2] + 1.7).abs().median()) < 0.1
+
+
+# Ranges between columns.
+
+
+def test_ranges_between_returns_of_a_row_are_those_of_a_slow_loop_and_never_across_a_jump():
+    rng = np.random.default_rng(0)
+    azimuth_rad = math.pi - 2 * math.pi * (np.arange(24) + 0.5) / 24
+    range_m = np.where(rng.random((3, 24)) < 0.5, rng.choice([5.0, 6.0, 30.0], (3, 24)), 0.0)
+    at_most = 3.5 * 2 * math.pi / 24
+    found = along_rows(range_m, azimuth_rad, at_most)
+    for row in range(3):
+        for column in range(24):
+            if range_m[row, column]:
+                assert found[row, column] == pytest.approx(range_m[row, column])
+                continue
+            left = next(step for step in range(1, 25) if range_m[row, (column - step) % 24])
+            right = next(step for step in range(1, 25) if range_m[row, (column + step) % 24])
+            first, second = range_m[row, (column - left) % 24], range_m[row, (column + right) % 24]
+            one_surface = abs(math.log1p(first) - math.log1p(second)) <= EDGE
+            share = left / (left + right)
+            wanted = 1 / ((1 - share) / first + share / second) if one_surface and left + right <= 3 else 0
+            assert found[row, column] == pytest.approx(wanted)
+
+
+def test_the_median_over_columns_is_that_of_numpy():
+    rng = np.random.default_rng(1)
+    range_m = np.where(rng.random((4, 30)) < 0.7, 2 + 9 * rng.random((4, 30)), 0)
+    known = rng.random((4, 30)) < 0.3
+    found = _smoothed(range_m, known, 2)
+    for row in range(4):
+        for column in range(30):
+            there = [(column + step) % 30 for step in range(-2, 3)]
+            values = [range_m[row, at] for at in there if range_m[row, at] > 0 and not known[row, at]]
+            own = range_m[row, column]
+            wanted = np.median(values) if own > 0 and not known[row, column] else own
+            assert found[row, column] == pytest.approx(wanted)
+
+
+# Files.
+
+
+def columns_of_file(scan: Scan) -> dict:
+    return {name: np.asarray(values) for name, values in scan.rows.columns.items()}
+
+
+def put_pcd(path, with_nan: bool = False) -> dict:
+    """Write a driver's PCD: intensity to 255, rings from the bottom, times in 64 bits, and a placeholder."""
+    scan = unproject(street(SIXTEEN))
+    columns = {axis: scan.points_xyz_m[:, at].numpy().copy() for at, axis in enumerate("xyz")}
+    if with_nan:
+        columns["x"][5] = columns["y"][5] = columns["z"][5] = np.nan
+    columns["intensity"] = (255 * scan.reflectance).round().numpy()
+    columns["ring"] = (15 - scan.ring).numpy().astype(np.uint16)
+    columns["timestamp"] = 1.6e9 + np.arange(len(scan)) * 1e-6
+    columns["return_type"] = (np.arange(len(scan)) % 3).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Pcd.write_columns(path, columns)
+    return columns
+
+
+def test_a_file_keeps_all_its_rows_and_columns_bit_for_bit(tmp_path):
+    before = put_pcd(tmp_path / "in/a.pcd", with_nan=True)
+    words = ["upsample", f"{tmp_path}/in", f"{tmp_path}/out", "--sensor", "vlp16", "--to", "pandar64"]
+    assert main([*words, "--model", "nearest", "--bad-points", "drop"]) == 0
+    after = columns_of_file(read_scan(tmp_path / "out/a.pcd", bad_points="drop"))
+    count = len(before["x"])
+    assert set(after) == {*before, "filled"}
+    for name, values in before.items():
+        assert after[name][:count].tobytes() == values.tobytes(), name
+        assert after[name].dtype == values.dtype
+    assert not after["filled"][:count].any()
+    assert after["filled"][count:].all()
+    assert len(after["x"]) > 1.5 * count
+    assert after["ring"].max() == 15
+    assert set(after["timestamp"]) == set(before["timestamp"][[at for at in range(count) if at != 5]]) | {
+        before["timestamp"][5]
+    } or set(after["timestamp"]) <= set(before["timestamp"])
+    assert 0 < after["intensity"][count:].max() <= 255
+
+
+def test_time_and_other_columns_go_into_another_format(tmp_path):
+    before = put_pcd(tmp_path / "in/a.pcd")
+    words = [
+        "upsample",
+        f"{tmp_path}/in",
+        f"{tmp_path}/out",
+        "--sensor",
+        "vlp16",
+        "--to",
+        "pandar64",
+        "--format",
+        "npz",
+    ]
+    assert main([*words, "--model", "nearest"]) == 0
+    with np.load(tmp_path / "out/a.npz") as after:
+        count = len(before["x"])
+        assert np.array_equal(after["points"][:count], np.stack([before[axis] for axis in "xyz"], 1))
+        assert np.array_equal(after["timestamp"][:count], before["timestamp"])
+        assert after["filled"].sum() == len(after["points"]) - count > 0
+
+
+@pytest.mark.parametrize("ending", [".bin", ".npy", ".npz", ".ply", ".csv", ".pcd"])
+def test_own_output_is_read_back_and_seen_without_loss(ending, tmp_path, capsys):
+    scan = unproject(street(DENSE.fine()))
+    fired = torch.argsort(
+        scan.ring * 10 + torch.atan2(scan.points_xyz_m[:, 1], scan.points_xyz_m[:, 0]) % (2 * math.pi)
+    )
+    scan = Scan(scan.points_xyz_m[fired], scan.reflectance[fired], scan.ring[fired])
+    (tmp_path / "sensor.json").write_text(json.dumps(DENSE.fine().to_json()))
+    next(one for one in formats.candidates(tmp_path / f"a{ending}")).write(tmp_path / f"in/a{ending}", scan)
+    before = read_scan(tmp_path / f"in/a{ending}")
+    words = ["complete", f"{tmp_path}/in", f"{tmp_path}/out", "--model", "triangulation"]
+    assert main([*words, "--sensor", f"{tmp_path}/sensor.json"]) == 0
+    told = capsys.readouterr().out
+    after = read_scan(tmp_path / f"out/a{ending}")
+    assert torch.equal(after.points_xyz_m[: len(before)], before.points_xyz_m)
+    assert torch.equal(after.reflectance[: len(before)], before.reflectance)
+    filled = len(after) - len(before)
+    assert after.filled.tolist() == [False] * len(before) + [True] * filled
+    assert f"{len(after):,} points, {len(before):,} measured and {filled:,} filled" in told
+    assert f"lidargrit view {tmp_path}/out" in told
+    (shown,) = load_scan_sets([f"{tmp_path}/out"], 1, settings=ScanSettings(), all_columns=True)
+    assert int(shown.images.return_mask.sum()) == len(after), "each point has a pixel of its own"
+    assert int(shown.filled.sum()) == filled
+    assert main(["view", f"{tmp_path}/out", "-o", f"{tmp_path}/v.html"]) == 0
+    assert main(["view", f"{tmp_path}/out", "-o", f"{tmp_path}/v.png"]) == 0
+    assert "WARNING" not in capsys.readouterr().err
+    assert '"filled"' in (tmp_path / "v.html").read_text()
+
+
+def test_marks_that_do_not_fit_are_refused(tmp_path):
+    KittiBin.write(tmp_path / "a.bin", unproject(street(DENSE)))
+    (tmp_path / "a.filled").write_bytes(b"\1\0")
+    with pytest.raises(formats.ScanError, match=r"2 bytes up to 1 in .*a.filled; wanted a byte of 0 or 1 for each"):
+        read_scan(tmp_path / "a.bin")
+
+
+def test_nuscenes_keeps_its_own_file_with_the_rows_that_are_no_points(tmp_path):
+    sensor = load_sensor("hdl32e")
+    scan = unproject(street(sensor.with_columns(256)))
+    form = formats.load("nuscenes_bin")
+    form.write(tmp_path / "in/a.pcd.bin", scan)
+    rows = np.fromfile(tmp_path / "in/a.pcd.bin", "<f4").reshape(-1, 5)
+    rows[7, :3] = (0.1, 0.2, 0.05)  # a beam that did not return
+    rows.tofile(tmp_path / "in/a.pcd.bin")
+    words = ["upsample", f"{tmp_path}/in", f"{tmp_path}/out", "--to", "pandar64", "--model", "nearest"]
+    assert main([*words, "--sensor", "hdl32e"]) == 0
+    after = np.fromfile(tmp_path / "out/a.pcd.bin", "<f4").reshape(-1, 5)
+    assert after[: len(rows)].tobytes() == rows.tobytes()
+    assert len(after) > len(rows)
+    assert len(read_scan(tmp_path / "out/a.pcd.bin")) == len(after) - 1
+
+
+# Input that is none.
+
+
+@pytest.mark.parametrize("verb", ["complete", "raydrop"])
+@pytest.mark.parametrize(
+    ("what", "told"),
+    [
+        ("empty", "an empty file"),
+        ("nan", "with NaN or infinite coordinates"),
+        ("rolled", "outside the sensor's elevations"),
+        ("other", "16 rings in"),
+    ],
+)
+def test_input_that_cannot_be_used_is_told_in_one_line(verb, what, told, tmp_path, capsys):
+    xyz = unproject(street(DENSE.fine())).points_xyz_m.numpy()
+    if what == "empty":
+        xyz = xyz[:0]
+    if what == "nan":
+        xyz[3] = np.nan
+    if what == "rolled":
+        xyz = np.ascontiguousarray(xyz[np.random.default_rng(0).permutation(len(xyz))][:, [0, 2, 1]])  # a camera's axes
+    rows = np.concatenate((xyz, np.zeros((len(xyz), 1), np.float32)), 1)
+    (tmp_path / "in").mkdir()
+    rows.astype("<f4").tofile(tmp_path / "in/a.bin")
+    if what == "other":
+        (tmp_path / "in/a.bin").unlink()
+        put_pcd(tmp_path / "in/a.pcd")
+    assert main([verb, f"{tmp_path}/in", f"{tmp_path}/out"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert told in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change", ["turned", "mirrored"])
+def test_a_turned_or_mirrored_cloud_comes_back_whole(change):
+    scan = unproject(street(DENSE.fine()))
+    x, y, z = scan.points_xyz_m.T
+    points = torch.stack((-y, x, z) if change == "turned" else (x, -y, z), 1)
+    done = complete_scan(Scan(points, scan.reflectance), open_model("nearest", sensor=DENSE.fine()))
+    assert torch.equal(done.whole().points_xyz_m[: len(points)], points)
+
+
+# Real scans of eight sensors.
+
+REAL = {
+    "HDL-64E, KITTI": ("kitti_odometry/sequences/00/velodyne/000000.bin", "complete", ""),
+    "HDL-64E, KITTI-360": ("kitti_360/data_3d_raw/*/velodyne_points/data/0000000000.bin", "complete", ""),
+    "VLP-16": ("other_sensors/vlp16_like/000000.pcd", "upsample", "vlp16"),
+    "VLP-16, nebula": ("other_sensors/nebula/vlp16/*.pcd", "upsample", "vlp16"),
+    "HDL-32E, nuScenes": ("other_sensors/nuscenes_hdl32e/n015*.pcd.bin", "upsample", "hdl32e"),
+    "VLP-32C, Argoverse 2": ("other_sensors/argoverse2_2xvlp32c/*.feather", "upsample", "vlp32c"),
+    "VLP-32C, nebula": ("other_sensors/nebula/vlp32/*.pcd", "upsample", "vlp32c"),
+    "OS1-128, Ouster": ("other_sensors/ouster/*.pcap", "complete", "os1_128"),
+    "Pandar64, nebula": ("other_sensors/nebula/64/*.pcd", "complete", "pandar64"),
+}
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize("name", REAL)
+def test_real_clouds_come_back_whole(name, real):
+    """As many points as came in, bit for bit, before those that were filled; raydrop gives some of them."""
+    pattern, verb, sensor = REAL[name]
+    scan = read_scan(next(iter(sorted(real.glob(pattern)))))
+    own = load_sensor(sensor or "hdl64e_kitti_odometry").fine()
+    dense = load_sensor("os1_64") if verb == "upsample" else own
+    task = AddRows(own) if verb == "upsample" else Fill(Pattern("returns"))
+    done = complete_scan(scan, open_model("triangulation", sensor=dense), task)
+    whole = done.whole()
+    assert bool(done.kept.all())
+    assert is_kept(scan, whole, done.kept)
+    assert len(done.filled) > 0
+    print(f"{name}: {verb} {len(scan):,} -> {len(whole):,}, {len(done.filled):,} filled")
+    if verb == "complete" and not sensor:
+        dropped = complete_scan(scan, open_model("pretrained", "surfaces", device="cpu"), Drop())
+        assert 0.5 * len(scan) < int(dropped.kept.sum()) < len(scan)
+        print(f"{name}: raydrop {len(scan):,} -> {int(dropped.kept.sum()):,}")
