@@ -75,7 +75,7 @@ class NumpyArray(ScanFormat):
                 raise damaged(path, _FORMAT, error) from None
             columns, names = _row_columns(rows, path), list(rows.dtype.names or ())
             if (marks := read_marks(path, len(next(iter(columns.values()), ())))) is not None:
-                columns["filled"] = marks.numpy()
+                columns["filled"] = marks.numpy().astype(np.uint8)
         else:
             with _archive(BytesIO(data), path) as archive:
                 columns, names = (

@@ -7,12 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
-from lidargrit.scans.projection.sensor_check import projection_that_fits
+from lidargrit.scans.projection.sensor_check import known_rings
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
 from lidargrit.scans.types import RangeImage, Scan
 
@@ -86,13 +85,16 @@ def phase_seed(seed: int, phase: int) -> int:
 def columns_fired(scan: Scan, model: SensorModel) -> int:
     """Return in about how many columns the sensor of a scan fires; 0 where too few points tell.
 
-    It is a turn over the usual step of azimuth between neighbours in a row.
+    It is a turn over the usual step of azimuth between neighbours of a ring, or of a row of the model where rings are
+    not known.
     """
-    pixels = pixel_coordinates(scan, model, projection_that_fits(scan, model), "exact")
-    row: Int[np.ndarray, "n"] = pixels.row[pixels.in_rows()]
-    x, y = scan.points_xyz_m.double().numpy()[pixels.in_rows(), :2].T
+    scan = scan.measured()
+    ring = known_rings(scan)
+    if ring is None:
+        ring = pixel_coordinates(scan, model, "spherical", "exact").row
+    x, y = scan.points_xyz_m.double().numpy()[:, :2].T
     azimuth_rad = np.arctan2(y, x)
-    order = np.lexsort((azimuth_rad, row))
-    steps_rad, change = np.diff(azimuth_rad[order]), np.diff(row[order])
+    order = np.lexsort((azimuth_rad, ring))
+    steps_rad, change = np.diff(azimuth_rad[order]), np.diff(ring[order])
     steps_rad = steps_rad[(change == 0) & (steps_rad > _ONE_RAY_RAD)]
     return round(2 * math.pi / float(np.median(steps_rad))) if len(steps_rad) >= _STEPS_AT_LEAST else 0

@@ -201,7 +201,7 @@ def closest_sensor(scan: Scan) -> str:
 def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[str, float] | None:
     """Return how far rings lie from the rows of each sensor with as many, in the mean; None where rings are unknown."""
     scan = scan.measured()
-    ring = _rings_in_order(scan) if scan.ring is None else scan.ring.numpy()
+    ring = known_rings(scan)
     if ring is None or int(ring.min()) < 0:
         return None
     points = np.bincount(ring)
@@ -305,6 +305,11 @@ def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) ->
     off_deg[(some < 0) | (some >= sensor.height)] = np.inf
     bottom_deg, top_deg = _span_of_rows_deg(sensor)
     return bool(np.median(off_deg) > _MISPLACED_AT_MOST * (top_deg - bottom_deg))
+
+
+def known_rings(scan: Scan) -> Int[np.ndarray, "n"] | None:
+    """Return the ring of each point, as the file or its firing order tells; None where neither does."""
+    return _rings_in_order(scan) if scan.ring is None else scan.ring.numpy()
 
 
 def _rings_in_order(scan: Scan) -> Int[np.ndarray, "n"] | None:
