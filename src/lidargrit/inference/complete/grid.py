@@ -10,7 +10,6 @@ import numpy as np
 from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
-from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
 from lidargrit.scans.projection.sensor_check import known_rings
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
 from lidargrit.scans.types import RangeImage, Scan
@@ -82,16 +81,15 @@ def phase_seed(seed: int, phase: int) -> int:
     return derive_seed(seed, phase) if phase else seed
 
 
-def columns_fired(scan: Scan, model: SensorModel) -> int:
-    """Return in about how many columns the sensor of a scan fires; 0 where too few points tell.
+def columns_fired(scan: Scan) -> int:
+    """Return in about how many columns the sensor of a scan fires; 0 where rings are not known, or hold few points.
 
-    It is a turn over the usual step of azimuth between neighbours of a ring, or of a row of the model where rings are
-    not known.
+    It is a turn over the usual step of azimuth between neighbours of a ring.
     """
     scan = scan.measured()
     ring = known_rings(scan)
     if ring is None:
-        ring = pixel_coordinates(scan, model, "spherical", "exact").row
+        return 0
     x, y = scan.points_xyz_m.double().numpy()[:, :2].T
     azimuth_rad = np.arctan2(y, x)
     order = np.lexsort((azimuth_rad, ring))
