@@ -169,7 +169,7 @@ PRESETS = {
         {
             # Fewer tokens are learned sooner, and the pixel decoder adds the detail that they leave out.
             "model.tokenizer.channel_multipliers": (1, 1, 2, 4),
-            **_NO_DROPOUT,  # which costs likelihood in so short a training, see docs/results/transformer-preset.md
+            **_NO_DROPOUT,  # which costs likelihood in so short a training, see docs/decisions/0020
             # Columns are 1.4 degrees apart and rows 0.4, so rows come closer last.
             "model.pixels": PixelDecoderConfig(16, row_halvings=2, surface_components=True, gravity_components=True),
             "training.transformer": replace(_BY_MUON, scans=40_000),
