@@ -21,7 +21,7 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
@@ -48,7 +48,7 @@ class InputScan:
     on_grid: Bool[Tensor, "H W"] | None = None
     doubt: str = ""
 
-    def joined(self, completed: RangeImage, condition: Condition) -> Scan:
+    def joined(self, completed: RangeImage, condition: Observed) -> Scan:
         """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
         rays.
 
