@@ -210,10 +210,9 @@ def plot(options: argparse.Namespace) -> str:
             of.sort(key=lambda row: float(row.training_operations))
             if not of:
                 continue
-            look = {"color": colormaps["tab20"](number), "marker": "osD^v8<>PX*hdpH12x"[number], "ms": 5, "lw": 1}
-            _errorbar(axes[0, column], of, "training_operations", look | {"label": system})
-            hollow = {"mfc": "none"} if float(of[-1].training_operations) < most / 2 else {}
-            _errorbar(axes[1, column], of[-1:], "seconds_a_scan", look | hollow)
+            _errorbar(axes[0, column], of, "training_operations", number)
+            hollow = float(of[-1].training_operations) < most / 2
+            _errorbar(axes[1, column], of[-1:], "seconds_a_scan", number, hollow)
         floor = next(float(row.real_against_real) for row in held if row.metric == metric)
         for axis in axes[:, column]:
             axis.axhline(floor, color="grey", ls=":", lw=1, label="real against real")
@@ -232,11 +231,17 @@ def plot(options: argparse.Namespace) -> str:
     return f"done: {options.png}"
 
 
-def _errorbar(axis: Axes, rows: list[Row], by: str, look: dict[str, object]) -> None:
+def _errorbar(axis: Axes, rows: list[Row], by: str, number: int, hollow: bool = False) -> None:
+    """Plot the rows of the system of this number over a cost."""
+    colour = colormaps["tab20"](number)
     values = [float(row.value) for row in rows]
     below = [value - float(row.low) for value, row in zip(values, rows, strict=True)]
     above = [float(row.high) - value for value, row in zip(values, rows, strict=True)]
-    axis.errorbar([float(getattr(row, by)) for row in rows], values, [below, above], **look)
+    costs = [float(getattr(row, by)) for row in rows]
+    look = axis.errorbar(costs, values, [below, above], label=SYSTEMS[number], color=colour, ms=5, lw=1)
+    look.lines[0].set_marker("osD^v8<>PX*hdpH12x"[number])
+    if hollow:
+        look.lines[0].set_markerfacecolor("none")
 
 
 def add(options: argparse.Namespace) -> str:
