@@ -38,7 +38,7 @@ class Task(ABC):
 
     def grid(self, scan: Scan, model: SensorModel) -> RayGrid:
         """Return the rays of a whole cloud."""
-        return RayGrid.fitting(model, columns_fired(scan))
+        return RayGrid.fitting(model, *columns_fired(scan))
 
     def see(self, scan: Scan, model: Model) -> InputScan:
         """Return a cloud on the rays that all of its points lie on.
