@@ -1,7 +1,5 @@
 """The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -111,13 +109,13 @@ class Guide(NamedTuple):
     return_logits: Float[Tensor, "B H W"]
     observed: Bool[Tensor, "B H W"] | None = None
 
-    def part(self, some: slice) -> Guide:
+    def part(self, some: slice) -> "Guide":
         """Return the guide of some of the scans."""
         observed = None if self.observed is None else self.observed[some]
         return Guide(self.features[some], self.v[some], self.return_logits[some], observed)
 
     @classmethod
-    def of(cls, decoded: Decoded) -> Guide:
+    def of(cls, decoded: Decoded) -> "Guide":
         """Return the guide from the output of the tokenizer's decoder.
 
         Raises:
@@ -133,7 +131,7 @@ class Guide(NamedTuple):
         return cls(at_least_32_bits(decoded.features), at_least_32_bits(decoded.range_m).log1p(), logits)
 
     @classmethod
-    def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> Guide:
+    def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> "Guide":
         """Return the guide of scans of which no token tells anything, as numbers of the type of another tensor."""
         size = (count, sensor.height, sensor.width)
         return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, TYPICAL_LOG_RANGE), like.new_zeros(size))
@@ -217,7 +215,7 @@ class MaskNetwork(PhaseNetwork):
         self.noise = PhaseNoise(self.phases)
 
     @classmethod
-    def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
+    def behind(cls, features: int, width: int, sensor: SensorModel) -> "MaskNetwork":
         """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
         it sees.
 
