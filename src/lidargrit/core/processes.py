@@ -4,8 +4,6 @@
 that lies among somebody's downloads would then run in place of Python's own module, with the user's rights.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

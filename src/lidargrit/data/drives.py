@@ -1,7 +1,5 @@
 """Simulated drives as files: seeds → a tree laid out as KITTI odometry and SemanticKITTI are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path

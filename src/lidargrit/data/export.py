@@ -1,7 +1,5 @@
 """Scans for other programs: samples, prepared scans or a data set → a folder of point clouds, or a KITTI tree."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Range images on disk → batches in memory, of only the images that are asked for."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -47,7 +45,7 @@ class Provenance:
     fingerprints: tuple[str, ...] = ()
     range_fingerprints: tuple[str, ...] = ()
 
-    def overlap(self, other: Provenance) -> str:
+    def overlap(self, other: "Provenance") -> str:
         """Return in a few words what two sets share; "" if they share nothing that is known.
 
         Two scans are the same if their files, their pixels or their ranges are. Scans of one drive show the same
@@ -94,7 +92,7 @@ class RangeImages:
         self._ends = list(accumulate(len(store) for store in self._stores))
 
     @classmethod
-    def joined(cls, sensor: SensorModel, parts: Sequence[RangeImages]) -> RangeImages:
+    def joined(cls, sensor: SensorModel, parts: "Sequence[RangeImages]") -> "RangeImages":
         """Join the images of several sets into one set, in their order."""
         return cls(sensor, [store for part in parts for store in part._stores])
 

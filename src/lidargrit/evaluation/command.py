@@ -1,7 +1,5 @@
 """Two names and a configuration → scores or errors of reconstruction: what ``lidargrit evaluate`` does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

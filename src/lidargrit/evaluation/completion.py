@@ -1,7 +1,5 @@
 """Errors of completion: whole scans with hidden parts → errors of the filled pixels."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What a system of a benchmark costs: parameters, operations, time and bits → costs.json → a block of the table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

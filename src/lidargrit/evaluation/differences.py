@@ -4,8 +4,6 @@ The interval of a difference comes from the same half-samples as those of the tw
 compared with the same half of the reference. The chance of the reference, which is common to both, cancels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Likelihood of scans under a model: range images → bits with intervals, and maps of bits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace

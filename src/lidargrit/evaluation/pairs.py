@@ -1,7 +1,5 @@
 """The two sets of an evaluation: sources → equally many range images of each, and warnings about the comparison."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -174,7 +172,7 @@ class _Opened:
     doubts: tuple[str, ...]
 
     @classmethod
-    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> _Opened:
+    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> "_Opened":
         images = source.images(sensor, config, reporter)
         return cls(source, images, source.projection_variant(config), source.doubts)
 

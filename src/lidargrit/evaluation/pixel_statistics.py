@@ -1,7 +1,5 @@
 """Real scans → scans of pixel statistics: each pixel is that of another scan, so that no shape is left."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import torch

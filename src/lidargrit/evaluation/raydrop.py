@@ -1,7 +1,5 @@
 """Drops of a model on clean scans, and independent drops → distances of their curves from those of true drops."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any

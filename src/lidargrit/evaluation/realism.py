@@ -1,7 +1,5 @@
 """Real scans, simulated scans, and independent drops of one rate → distances between their curves."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A table of the paper, a folder of scans → its systems prepared, trained, sampled, scored; goes on where stopped."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Two sets and a list of metrics → scores with intervals and reference rows; shared features are computed once."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field

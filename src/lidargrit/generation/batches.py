@@ -1,7 +1,5 @@
 """What callers pass to a generator is checked, and its scans are computed in batches of one size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 from numbers import Integral
 from typing import overload

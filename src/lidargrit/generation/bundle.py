@@ -1,7 +1,5 @@
 """The runs of a bundle beside the one that samples: a condition → the run that was trained for what is known of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Generic, TypeVar
 

@@ -1,7 +1,5 @@
 """What a stage of training minimises: (examples, random numbers) → the terms of a loss."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import torch
@@ -76,7 +74,7 @@ class Objective(nn.Module, ABC):
         """
         return 0
 
-    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+    def weights_from(self, trained: "Objective") -> dict[str, Tensor]:
         """Return the weights of a trained objective of this kind in the shapes of this one's, where that is possible.
 
         Training goes on from them; weights that the trained one lacks keep the values that they have.

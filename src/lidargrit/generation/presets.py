@@ -1,7 +1,5 @@
 """A preset is an entry of a table: name → :class:`Preset`; and what the presets of several systems share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ranges in whole steps of some millimetres, between a sensor's limits: metres ⇄ integers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from numbers import Integral

@@ -1,7 +1,5 @@
 """Range images ⇄ log ranges in [-1, 1], beside them reflectance; no return is a level below that of every return."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

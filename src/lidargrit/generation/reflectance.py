@@ -1,7 +1,5 @@
 """Reflectance in networks that take range images: what they learn from, and how far an estimate is off."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

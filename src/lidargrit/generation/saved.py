@@ -1,7 +1,5 @@
 """A network with its configuration and sensor ⇄ the two files in which it is saved, here or on the Hugging Face hub."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from collections.abc import Callable

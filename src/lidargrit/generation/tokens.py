@@ -1,7 +1,5 @@
 """Base of generators of tokens, with any tokenizer and any order of sampling."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, field, fields, replace

@@ -1,7 +1,5 @@
 """(generator, seeds) → a folder of generated scans, one a file; data/sources/samples.py reads it."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence

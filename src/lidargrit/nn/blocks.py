@@ -1,7 +1,5 @@
 """Base classes of networks and of their repeated blocks; compilation and recomputation in training."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import torch

@@ -1,7 +1,5 @@
 """Weights of a file → the module of the very same layout; others are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

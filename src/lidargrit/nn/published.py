@@ -1,7 +1,5 @@
 """An untrusted file of torch.save → the tensors in it, by name, and nothing else."""
 
-from __future__ import annotations
-
 import io
 import warnings
 import zipfile

@@ -1,7 +1,5 @@
 """A small U-Net over range images, for maps of classical hints: maps at full size → maps at full size."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple

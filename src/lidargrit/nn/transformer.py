@@ -4,8 +4,6 @@ They read whole sequences; ``nn.decoding`` generates token by token with the sam
 reference's state dict (a minGPT), so that published weights load.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """The facts of a run → a model card: Markdown for people, with a header for the Hugging Face hub."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """Range images → randomly changed ones for training; range, return mask, reflectance and label change together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A revolution begins straight ahead and goes counter-clockwise, in the firing order of KITTI's files.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -38,7 +36,7 @@ class Beams:
     clear: Bool[np.ndarray, "H W"]
 
     @classmethod
-    def sample(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> Beams:
+    def sample(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> "Beams":
         """Aim at every fine column of a sensor, with the small jitter of a turning head.
 
         A pixel whose ray leaves its column by the jitter gets no firing.
@@ -56,7 +54,7 @@ class Beams:
         step = np.float32(2 * math.pi / clear.shape[1])
         return cls(elevation, azimuth - aside * step, turn, fired, clear)
 
-    def columns(self, which: slice) -> Beams:
+    def columns(self, which: slice) -> "Beams":
         """Return the rays of some columns."""
         shared = self.elevation_rad.shape[1] == 1
         return replace(

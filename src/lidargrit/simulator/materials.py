@@ -1,7 +1,5 @@
 """Materials of surfaces: a name → how the material reflects a beam of 905 nm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Observation of a scene: a scene, a sensor and a random stream → surface, signal and label of every pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 

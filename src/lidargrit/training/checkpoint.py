@@ -1,7 +1,5 @@
 """State of a stage in training (weights, their average, the optimiser) ⇄ one file."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

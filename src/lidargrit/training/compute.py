@@ -1,7 +1,5 @@
 """A preset → the floating-point operations of its training, and the preset scaled to a budget of them."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable, Collection, Mapping

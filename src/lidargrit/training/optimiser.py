@@ -1,7 +1,5 @@
 """Optimiser, learning rate and moving average of the weights: (configuration, scans seen) → update."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """The plan of a preset's training: every setting by its name, sizes, budgets and estimated cost."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any

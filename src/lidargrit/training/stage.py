@@ -1,7 +1,5 @@
 """The training loop of every model: (objective, range images, configuration) → trained weights in a folder."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Trained stages of another run that a preset takes as they are: preset → objectives by the name of their stage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

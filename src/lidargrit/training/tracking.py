@@ -1,7 +1,5 @@
 """A run's TensorBoard files → a project on Weights & Biases."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Curves of real scans, of simulated ones, and of scans whose rays are dropped independently: scores → PNG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

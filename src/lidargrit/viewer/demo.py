@@ -1,7 +1,5 @@
 """The whole pipeline: scans → range images → trained networks → new scans → scores → one page."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -215,7 +213,7 @@ def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSamp
     return tokenizer.sample(tokens, rngs)
 
 
-def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
+def _packaged_samples(folder: Path, clock: "_Clock", reporter: Reporter) -> RangeImages:
     """Sample from the model in the package, which was trained for hours, for comparison."""
     with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
         model, run = load(PRETRAINED).to(usable_device("")), locate(PRETRAINED)

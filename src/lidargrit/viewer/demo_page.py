@@ -1,7 +1,5 @@
 """The page of the demo, for newcomers: a scan, its tokens, its reconstruction and new scans → HTML."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

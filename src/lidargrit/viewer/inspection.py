@@ -1,7 +1,5 @@
 """Losses and errors of a projection as a picture: :class:`Inspection` → PNG."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

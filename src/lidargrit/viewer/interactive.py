@@ -4,8 +4,6 @@ The page holds ranges in 16 bits and the rays of each sensor once; the browser c
 and style sheet are the files in ``browser/``.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

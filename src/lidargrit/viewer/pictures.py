@@ -1,7 +1,5 @@
 """Range images side by side as a picture: groups of range images → one PNG."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -101,7 +99,7 @@ class _Scales:
     height_colours: Colormap
 
     @classmethod
-    def of(cls, panels: list[_Panel], max_range_m: float | None) -> _Scales:
+    def of(cls, panels: list[_Panel], max_range_m: float | None) -> "_Scales":
         """Return scales that hold all but the outermost returns of all panels."""
         ranges = np.concatenate([panel.range_m[panel.return_mask] for panel in panels] + [np.array([1.0])])
         points = np.concatenate([panel.points_xyz_m for panel in panels] + [np.zeros((1, 3))])

@@ -1,7 +1,5 @@
 """An evaluation as one page that needs nothing else: scorecard and the two sets → HTML."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import fields, replace

@@ -1,7 +1,5 @@
 """Sources of scans, and runs → sets of range images to look at."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

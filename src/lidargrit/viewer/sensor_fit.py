@@ -1,7 +1,5 @@
 """Evidence for and against a fitted sensor as a picture: :class:`SensorFit` → PNG."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

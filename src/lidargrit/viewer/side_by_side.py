@@ -1,7 +1,5 @@
 """Sets of scans side by side on one scale: sources → a PNG, or a page to turn and step through."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

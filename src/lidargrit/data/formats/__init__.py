@@ -1,7 +1,5 @@
 """Files of scans: a path → :class:`Scan`, whichever sensor or program wrote it; one format = one file here."""
 
-from __future__ import annotations
-
 import functools
 import os
 from abc import ABC, abstractmethod
@@ -93,7 +91,7 @@ class ScanFormat(ABC):
         """Read one scan of a file, or raise ScanError."""
 
     @classmethod
-    def of_topic(cls, topic: str) -> type[ScanFormat]:
+    def of_topic(cls, topic: str) -> "type[ScanFormat]":
         """Return the format that reads one topic of a recording; itself where files have no topics."""
         return cls
 

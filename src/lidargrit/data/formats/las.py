@@ -1,7 +1,5 @@
 """LAS files of the surveying world, uncompressed ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from datetime import date

@@ -1,7 +1,5 @@
 """Ouster .pcap with its .json of the same name: packets of any Ouster sensor → :class:`Scan` with a ring per point."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math

@@ -1,7 +1,5 @@
 """Range images as 16-bit PNG, 64 rows high ⇄ :class:`Scan` with a ring per point."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from dataclasses import replace

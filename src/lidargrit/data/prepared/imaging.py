@@ -1,7 +1,5 @@
 """A few scans of a set → the projection for all of them, and signs of a wrong sensor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from lidargrit.core.determinism import evenly_spaced

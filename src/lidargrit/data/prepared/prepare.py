@@ -1,7 +1,5 @@
 """Sources of scans → prepared range images, projected once by many processes, and resumed where they were stopped."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time

@@ -4,8 +4,6 @@ These are commands of their own and not a pool of multiprocessing: they need onl
 script needs no guard against being imported again, and they end when the caller dies.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import queue

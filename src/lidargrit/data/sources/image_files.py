@@ -1,7 +1,5 @@
 """Range images that other programs saved as ``.npy``: one file, or a folder of nothing else → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

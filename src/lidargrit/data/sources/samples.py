@@ -1,7 +1,5 @@
 """A folder of generated scans, one a file → their range images, and what it says of their model."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """Where points lie, seen from above, over a whole set: two sets → Jensen-Shannon distance of their 1.6 m cells."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where points lie, seen from above, scan by scan: two sets → maximum mean discrepancy of their 1.6 m cells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Coverage (COV): the share of real clouds that are the nearest to some generated one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

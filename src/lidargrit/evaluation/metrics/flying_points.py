@@ -1,7 +1,5 @@
 """Share of returns in mid-air between two surfaces at an edge: two sets → Jensen-Shannon distance over gap widths."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int64

@@ -1,7 +1,5 @@
 """Which 5 cm cells, seen from above, hold points: two sets → Jensen-Shannon distance, as LiDM's toolbox has it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which 0.5 m cells, seen from above, hold points: two sets → minimum matching distance, LiDM's "MMD"."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How near generated clouds come to each real one: two sets → mean Chamfer distance of the nearest, the paper's MD."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from lidargrit.evaluation.metrics.shared.clouds import CloudMetric

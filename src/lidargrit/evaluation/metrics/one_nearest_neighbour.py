@@ -1,7 +1,5 @@
 """Accuracy of the nearest neighbour (1-NNA) at telling generated clouds from real ones; 0.5 is the best."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

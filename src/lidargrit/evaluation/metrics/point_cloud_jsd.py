@@ -1,7 +1,5 @@
 """Where points lie in space, over a whole set: two sets → 3-D Jensen-Shannon divergence in a ball of grid points."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, ClassVar
 

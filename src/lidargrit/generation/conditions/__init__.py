@@ -1,7 +1,5 @@
 """What a generator is told of training scans: the name of a kind, as in ``data.condition=NAME`` → how scans tell it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import ClassVar
 

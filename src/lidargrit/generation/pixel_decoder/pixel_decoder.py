@@ -1,7 +1,5 @@
 """Pixels generated in phases from coarse to fine, with exact probabilities: output of a decoder → range images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

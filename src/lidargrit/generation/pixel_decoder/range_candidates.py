@@ -1,7 +1,5 @@
 """Ranges that pixels of earlier phases suggest for those of a phase: neighbours, and surfaces through neighbours."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

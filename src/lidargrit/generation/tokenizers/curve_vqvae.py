@@ -1,7 +1,5 @@
 """LiDM's first stage, a VQ-VAE whose finest levels shorten the rows alone, curve by curve."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

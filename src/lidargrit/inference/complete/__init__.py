@@ -1,7 +1,5 @@
 """What completes scans: the name of a run or of a classical method → a generator, with the settings it completes by."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

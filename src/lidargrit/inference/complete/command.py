@@ -1,7 +1,5 @@
 """The verbs complete, upsample and raydrop: a source, a model and a folder → files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lidargrit.core.reporting import Reporter

@@ -1,7 +1,5 @@
 """Scans of a user → their completions in files, which have the names of the scans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby, islice

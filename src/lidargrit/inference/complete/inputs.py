@@ -1,7 +1,5 @@
 """A user's scans → range images on the grid of a sensor, and the points that lie in their pixels."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -83,7 +81,7 @@ class Inputs:
         reporter: receiver of how many points of the first scan have a pixel, and of the first doubt about the sensor.
     """
 
-    def __init__(self, scans: PointScans | ImageScans, reader: ScanReader, reporter: Reporter) -> None:
+    def __init__(self, scans: PointScans | ImageScans, reader: "ScanReader", reporter: Reporter) -> None:
         self._scans, self._reader, self._reporter = scans, reader, reporter
         self._counted = self._doubted = False
 

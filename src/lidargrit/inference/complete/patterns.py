@@ -1,7 +1,5 @@
 """Which pixels of a scan are taken as observed: words such as rows:4, or a file → a mask."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

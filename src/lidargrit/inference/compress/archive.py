@@ -7,8 +7,6 @@ scans lie without gaps, and one that was left out has no bytes. A file that was 
 altered, is refused.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import struct
@@ -54,7 +52,7 @@ class Entry(NamedTuple):
     num_returns: int
 
     @classmethod
-    def of(cls, facts: Sequence[Any]) -> Entry:
+    def of(cls, facts: Sequence[Any]) -> "Entry":
         """Check the facts of a line; raises TypeError or ValueError if they are none."""
         name, length, crc32, num_returns = facts
         if not (isinstance(name, str) and all(isinstance(each, int) for each in (length, crc32, num_returns))):
@@ -65,7 +63,7 @@ class Entry(NamedTuple):
 
 
 @contextmanager
-def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = None) -> Iterator[ArchiveWriter]:
+def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = None) -> "Iterator[ArchiveWriter]":
     """Give a writer of a file that appears when the block has ended well; if it was interrupted, the next goes on.
 
     Until then scans lie in a folder beside the file, named as the file with ``.unfinished``.

@@ -1,7 +1,5 @@
 """A source of scans → one file of compressed range images, and back into a file for each scan."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One range image ⇄ bytes, by a generator with a pixel decoder."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json

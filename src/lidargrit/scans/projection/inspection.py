@@ -1,7 +1,5 @@
 """Losses and errors of a projection: scan, sensor → :class:`Inspection`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any

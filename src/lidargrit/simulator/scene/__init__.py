@@ -1,7 +1,5 @@
 """A street scene: random numbers → triangles around a car with a sensor, at any time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import get_args
 

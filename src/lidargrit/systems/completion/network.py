@@ -1,7 +1,5 @@
 """A network that completes scans: observed pixels and classical fills → range, return, reflectance and class."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

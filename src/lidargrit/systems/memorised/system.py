@@ -1,7 +1,5 @@
 """Memorised training scans, as a reference row: seeds → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +66,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
     @classmethod
     def from_weights(
         cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
-    ) -> Memorised:
+    ) -> "Memorised":
         """Make a generator that keeps as many scans as the weights hold.
 
         Raises:

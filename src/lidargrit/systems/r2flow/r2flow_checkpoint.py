@@ -8,8 +8,6 @@ Source:
     r2flow/utils/option.py at 819d7d3 for files with it.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """R2Flow's trainings: a flow from noise to images, then pairs of noise and scan that straighten it."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A network of raydrop: the ranges of all surfaces → which of them return, sampled in phases, and how bright."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Codes that no latent chooses → codes where latents are: k-means over a reservoir of latents, now and then."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn

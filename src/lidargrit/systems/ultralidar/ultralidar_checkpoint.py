@@ -7,8 +7,6 @@ Source:
     myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT).
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

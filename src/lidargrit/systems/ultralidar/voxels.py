@@ -1,7 +1,5 @@
 """Points → occupied voxels about the sensor, and voxels → points, or range images along the sensor's rays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -61,7 +59,7 @@ class VoxelGrid:
         """Number of cells along z, y and x, the axes of a tensor of voxels."""
         return self.cells[2], self.cells[1], self.cells[0]
 
-    def swapped(self) -> VoxelGrid:
+    def swapped(self) -> "VoxelGrid":
         """Return the grid whose x axis is this one's y axis, and the other way round."""
         low_m, cell_m, cells = ((of[1], of[0], of[2]) for of in (self.low_m, self.cell_m, self.cells))
         return replace(self, low_m=low_m, cell_m=cell_m, cells=cells)

@@ -4,8 +4,6 @@ No path of a request is used as a path on disk: it is compared with a handful of
 a name of this machine is refused, so that no web page elsewhere can reach this server through somebody's browser.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import ipaddress

@@ -1,7 +1,5 @@
 """Run folders → a page at an address of this machine, until somebody ends it."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging

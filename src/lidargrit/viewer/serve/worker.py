@@ -4,8 +4,6 @@ The process reads and answers lines of JSON: no pickle passes, and the process t
 A job that takes too long, or all memory, ends with this process; the next job starts a new one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

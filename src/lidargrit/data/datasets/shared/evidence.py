@@ -1,7 +1,5 @@
 """What the points of a file say of the sensor that made it, where only a folder's layout names the data set."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Named columns, as PCD, PLY and NumPy files hold them ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings

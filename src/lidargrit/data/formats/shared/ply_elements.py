@@ -1,7 +1,5 @@
 """Rows of an element of a PLY file, lists among their properties → columns of the properties that are no list."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Samples as other programs write them, one tensor a file: folder of .pth → range images."""
 
-from __future__ import annotations
-
 import math
 import re
 import zipfile

@@ -1,7 +1,5 @@
 """Range images → the features that a pretrained network finds in them, for metrics that compare two sets of these."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -45,7 +43,7 @@ class UnitClouds:
     returns_only: bool
 
     @classmethod
-    def of(cls, variant: str, sensor: SensorModel) -> UnitClouds:
+    def of(cls, variant: str, sensor: SensorModel) -> "UnitClouds":
         """Return the inputs of a published definition for images of a sensor.
 
         Args:
@@ -81,7 +79,7 @@ class NormalisedImages:
     window_m: tuple[float, float] | None
 
     @classmethod
-    def of(cls, variant: str) -> NormalisedImages:
+    def of(cls, variant: str) -> "NormalisedImages":
         """Return the inputs of a published definition: ``r2dm`` keeps 0.5 to 63 m, ``exact`` takes all returns."""
         return cls(_LIDARGEN_WINDOW_M if variant == "r2dm" else None)
 

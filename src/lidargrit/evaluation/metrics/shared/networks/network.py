@@ -1,7 +1,5 @@
 """A network's name and the file with its weights → features of images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
