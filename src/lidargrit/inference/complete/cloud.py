@@ -71,8 +71,8 @@ def filled_scan(seen: InputScan, condition: Observed, images: RangeImage, hides:
 
     Args:
         seen: scan on its rays, which are several images of the model.
-        condition: what was observed of each of these images.
-        images: what the model made of each.
+        condition: observed part of each of these images.
+        images: the model's completion of each.
         hides: whether measured points outside the observed pixels are left out.
     """
     grid = seen.rays

@@ -25,7 +25,7 @@ def complete_scans(
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: an empty folder, or one that the same command began.
         model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
-        task: what is done with each scan.
+        task: the work on each scan.
         output: number and kind of files.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
 

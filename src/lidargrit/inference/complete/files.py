@@ -7,8 +7,9 @@ from itertools import accumulate, chain, groupby, islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
@@ -103,7 +104,7 @@ def write_completions(
     Args:
         inputs: scans of the user.
         out: an empty folder, or one that the same command began.
-        task: what is done with each scan.
+        task: the work on each scan.
         output: number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
@@ -121,7 +122,7 @@ def write_completions(
     skipped = left_out if config.bad_scans == "skip" else None
     jobs = _jobs(inputs, missing, model, task, output, skipped, reporter)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
-    sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, [0, 0, 0]
+    sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, np.zeros(3, dtype=np.int64)
     with (
         claim_folder(out),
         claimed_scans(out / "completed.json", {**facts, "scans": identities}) as files_left_out,
@@ -137,13 +138,8 @@ def write_completions(
                     write_array(out / file, images.range_m[0])
                     kept_labels = images.label is None
                 else:
-                    if not sensor_file.exists():
-                        write_json(sensor_file, task.sensor_of_points(job.scan).to_json())
-                    seen = InputScan.of_image(job.scan.image) if job.scan.points is None else job.scan
-                    done = task.result(seen, job.condition, images)
-                    kept_labels = write_cloud(out / file, output.format, done, job.form)
-                    kept, added = int(done.kept.sum()), 0 if done.filled is None else len(done.filled)
-                    counts = [counts[0] + len(done.scan), counts[1] + kept + added, counts[2] + added]
+                    kept_labels, points = _write_cloud(out / file, sensor_file, output.format, task, job, images)
+                    counts += points
                 if not kept_labels and not told_labels:
                     told_labels = True
                     reporter.message(labels_lost(file))
@@ -151,7 +147,24 @@ def write_completions(
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
-    return Written(len(files) - len(left_out) * output.count, *counts, sensor_file)
+    return Written(len(files) - len(left_out) * output.count, *counts.tolist(), sensor_file)
+
+
+def _write_cloud(
+    path: Path, sensor_file: Path, kind: str, task: Task, job: _Job, images: RangeImage
+) -> tuple[bool, Int64[np.ndarray, "3"]]:
+    """Write a completed cloud, and the sensor of the first one.
+
+    Returns:
+        whether its labels are kept; points that came in, that went out, and that were filled.
+    """
+    if not sensor_file.exists():
+        write_json(sensor_file, task.sensor_of_points(job.scan).to_json())
+    seen = InputScan.of_image(job.scan.image) if job.scan.points is None else job.scan
+    done = task.result(seen, job.condition, images)
+    kept_labels = write_cloud(path, kind, done, job.form)
+    kept, added = int(done.kept.sum()), 0 if done.filled is None else len(done.filled)
+    return kept_labels, np.array([len(done.scan), kept + added, added])
 
 
 def _facts(model: Model, output: OutputConfig) -> dict[str, Any]:

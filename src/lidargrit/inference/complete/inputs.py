@@ -131,8 +131,8 @@ class Inputs:
 
         Args:
             index: index of the scan.
-            see: what brings a cloud to the rays that all of its points lie on; not given, it becomes one image of the
-                reader's sensor. A range image stays as it is.
+            see: function that brings a cloud to the rays that all of its points lie on; not given, it becomes one image
+                of the reader's sensor. A range image stays as it is.
 
         Raises:
             ScanError: a scan that cannot be used, or of another sensor.
@@ -157,7 +157,7 @@ class ScanReader:
     Args:
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
-        few_rings_cure: what to do with a scan of far fewer rows.
+        few_rings_cure: cure of a scan of far fewer rows.
     """
 
     sensor: SensorModel

@@ -175,7 +175,7 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
     Args:
         scan: points in the sensor's frame.
         model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
-        task: what to do; fill in every ray without a point if not given.
+        task: the work on it; every ray without a point is filled in if not given.
         seed: seed of what is sampled.
 
     Returns:
