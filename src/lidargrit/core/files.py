@@ -135,11 +135,7 @@ def _partial_file(folder: Path) -> Iterator[Path]:
 
 
 def _lock(folder: Path, kind: int) -> int:
-    """Lock a folder for this process and return the open lock file.
-
-    Raises:
-        OutputError: another process holds it.
-    """
+    """Lock a folder for this process and return the open lock file."""
     attempts = count(1)
     while True:
         with _missing(next(attempts)):  # as in _partial_file

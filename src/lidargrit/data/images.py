@@ -19,8 +19,6 @@ class Pixels(NamedTuple):
     """The pixels of one image.
 
     Args:
-        range_m: range in metres, 0 where there is no return.
-        reflectance: reflectance in [0, 1]; None if it is not known.
         label: class by SemanticKITTI's numbers, 0 where it is not known; None if it is not known anywhere.
     """
 
@@ -82,7 +80,6 @@ class RangeImages:
     """Range images of one sensor, in one or more stores, numbered through.
 
     Args:
-        sensor: sensor of the images that are returned.
         stores: sources of images that are as wide as the sensor's, or that have all of its fine columns.
     """
 

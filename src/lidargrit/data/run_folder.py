@@ -87,7 +87,6 @@ class SavedConfig(NamedTuple):
     Args:
         generator: name of its generator.
         config: configuration of the generator, as plain values.
-        sensor: sensor whose range images the generator generates.
     """
 
     generator: str

@@ -79,7 +79,6 @@ class Benchmark:
         """Return a preset with the settings and the budget that all systems get.
 
         Args:
-            name: name of the preset.
             check: whether it is still to be trained, so that its stages have to follow the settings.
 
         Raises:
@@ -107,7 +106,6 @@ def run(
         folder: output folder. It gets a run folder ``runs/PRESET``, and for each system ``SYSTEM/samples``, scores in
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
-        reporter: receiver of the progress.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
 
     Raises:
@@ -310,8 +308,6 @@ class _Plan:
         system: name of the system, as the user typed it.
         run: folder of a finished run, or of the one that the preset gets, or of samples.
         preset: preset that is trained; None for a finished run.
-        sampling: settings of the generator's own ``Sampling``.
-        sensor: sensor of the system's samples.
         samples: the samples, if they are there; None otherwise.
     """
 

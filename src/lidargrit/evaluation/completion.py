@@ -90,7 +90,6 @@ def compare_completion(
         patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
         completions: number of completions of each scan by a model that is random.
         seed: seed of the first completion, and of the random pixels.
-        reporter: receiver of progress and warnings.
 
     Returns:
         scores of all models by the first pattern, then by the next.

@@ -34,7 +34,6 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
     """Compare one system with another, both scored by one protocol against the same scans.
 
     Args:
-        name: name of the system.
         card: scores of the system.
         other_name: name of the system that it is compared with.
         other: scores of that other system.

@@ -25,7 +25,6 @@ class EvalSet:
     """One set of range images that goes into the metrics.
 
     Args:
-        source: name of the source, as the user typed it.
         images: all images of the source.
         indices: indices of the images that are compared.
         range_m: nearest and farthest range of a return, in metres, both excluded; None for no limits.
@@ -135,7 +134,6 @@ def pair_for_protocol(
         reference: source of the second set; scans are projected with the sensor of the first.
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.
-        reporter: receiver of the progress of the projection.
         sensor: sensor that scans are imaged with, in place of the protocol's; samples that are images keep theirs.
 
     Raises:

@@ -87,7 +87,6 @@ def raydrop_model(word: str, device: str = "") -> Generator:
 
     Args:
         word: folder of a finished run, or ``pretrained``.
-        device: device to compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: a run that cannot do one of both; no such device.

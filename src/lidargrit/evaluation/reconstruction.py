@@ -224,9 +224,7 @@ def score_run(
     Args:
         run: finished run.
         source: scans that the tokenizer encodes and decodes.
-        config: settings of reading and projecting scans.
         reporter: receiver of progress, and of a warning if the model has learned from these scans.
-        device: device that the networks compute on.
 
     Raises:
         ConfigError: a run whose generator has no tokenizer.

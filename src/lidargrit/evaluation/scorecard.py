@@ -35,7 +35,6 @@ class EvalSetRecord:
     """Entry of one evaluation set in a score file: what remains of the set when its images are gone.
 
     Args:
-        source: source, as the user named it.
         data_set: name of the data set; "samples" for generated scans.
         split: name of the split.
         scans: number of scans of the set.

@@ -20,11 +20,7 @@ class Bundle(Generic[RunT]):
         self._runs, self._read = runs, dict[Job, RunT]()
 
     def shares(self, condition: Observed) -> Iterator[tuple[RunT | None, list[int]]]:
-        """Yield each run with the indices of the scans that it completes; None for those that no run was trained for.
-
-        Args:
-            condition: observed part of each scan.
-        """
+        """Yield each run with the indices of the scans that it completes; None for those that no run completes."""
         jobs: list[Job] = [job_of(condition[[index]]) for index in range(len(condition))]
         for job in dict.fromkeys(jobs):
             yield self._run(job), [index for index, each in enumerate(jobs) if each == job]

@@ -99,7 +99,6 @@ def hidden_in_some(
         pixels: labels by SemanticKITTI's numbers, or reflectance.
         unknown: value of an unknown pixel.
         share: probability that a scan's pixels are hidden.
-        rng: source of the choice.
     """
     kept = torch.rand((len(pixels), 1, 1), generator=rng, device=rng.device) >= share
     return torch.where(kept.to(pixels.device), pixels, unknown)

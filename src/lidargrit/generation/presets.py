@@ -143,7 +143,6 @@ def preset(
         title: description in one line.
         data: settings of the data.
         model: configuration of one of the systems.
-        seed: seed of everything random.
         published: scores that a paper reports.
         stages_from: run whose stages are taken.
         fine_tune: names of stages that are trained further.

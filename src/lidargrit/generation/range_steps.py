@@ -22,10 +22,6 @@ class RangeSteps:
     Multiple k stands for all ranges that are nearer to it than to another one, between the limits of the sensor: the
     first and the last interval end there.
 
-    Args:
-        sensor: sensor of the ranges.
-        step_mm: step in millimetres.
-
     Raises:
         ConfigError: a step that is no whole number of millimetres from 1 to 1000.
     """

@@ -65,7 +65,6 @@ class SmallUnet(Network):
     """Maps at full size → maps at full size, through a half, a quarter and an eighth of the rows and columns.
 
     Args:
-        config: sizes of the network.
         inputs: channels of the input.
         outputs: channels of the output.
         parts: further inputs and outputs by a name of their own.

@@ -55,7 +55,6 @@ class Transformer(Network):
     """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
 
     Args:
-        config: sizes and dropout.
         num_inputs: number of different tokens that it reads.
         num_tokens: number of different tokens that it predicts.
         context_length: number of tokens in the longest sequence.

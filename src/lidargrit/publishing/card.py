@@ -33,7 +33,6 @@ def model_card(
     """Return the card of a model, made from the facts in its run folder alone.
 
     Args:
-        generator: the model.
         about: content of its ``run.json``; empty if there is no such file.
         learned: recordings and images that it was trained on.
         scores: scores of its samples, if there are any.

@@ -207,7 +207,6 @@ def fill_lacking(completed: RangeImage, condition: Observed) -> RangeImage:
 
     Args:
         completed: completed scans, on any device.
-        condition: observed part of each scan.
     """
     tells = condition.reflectance is not None and bool(condition.return_observed.any())
     lacks_reflectance = tells and completed.reflectance is None
@@ -293,10 +292,6 @@ def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
 
     Blocks of pixels are divided at random into two halves, and each half is triangulated from the returns of the other.
     So returned and dropped rays cannot be distinguished by the noise of a measured range.
-
-    Args:
-        images: batch of range images.
-        rng: source of the halves.
 
     Raises:
         ScanError: a scan without returns in one half.

@@ -43,7 +43,6 @@ class Beams:
 
         Args:
             sensor: sensor to simulate; columns that its image leaves out are included.
-            rng: source of the jitter.
             gap_share: share of pixels without a firing, which determines the strength of the jitter.
         """
         elevation, azimuth, turn, phase, clear = _aims(sensor)

@@ -8,7 +8,6 @@ class Material:
     """Reflection properties of one kind of surface; the albedo belongs to each triangle.
 
     Args:
-        name: name of the material.
         diffuse: factor on the triangle's albedo, the share scattered evenly; clear coats and panes scatter little.
         gloss: strength of the mirror-like lobe, seen only close to normal incidence.
         lobe_power: exponent of the cosine of incidence in that lobe; the higher, the narrower.

@@ -62,7 +62,6 @@ def training_flops(preset: Preset, taken: Collection[str] | None = None) -> dict
     scans do, are the steps computed.
 
     Args:
-        preset: preset whose training it is.
         taken: names of the stages that are taken from another run, if that is known already.
 
     Returns:
@@ -142,7 +141,6 @@ def with_budget(preset: Preset, flops: float) -> Preset:
     of the model that count scans only fall.
 
     Args:
-        preset: preset to scale.
         flops: number of floating-point operations that the training may take.
 
     Raises:

@@ -19,7 +19,6 @@ def tracked(project: str, preset: Preset, folder: Path) -> Iterator[None]:
     Args:
         project: name of the project; "" to send nothing.
         preset: preset of the run, whose settings are sent.
-        folder: run folder.
 
     Raises:
         ConfigError: the package wandb is missing, or the service refuses.

@@ -34,7 +34,6 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
     Args:
         scores: scores of curves.
-        path: path of the PNG; an older picture there is replaced in one step.
         title: title of the whole picture.
 
     Raises:

@@ -47,7 +47,6 @@ def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
     Args:
         card: scores and facts of the evaluation.
         pair: the two sets of scans that were compared.
-        path: path of the page; an older page there is replaced in one step.
 
     Raises:
         OutputError: the page cannot be written.

@@ -19,7 +19,6 @@ def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
 
     Args:
         fit: fitted sensor with its residuals.
-        path: path of the PNG; an older picture there is replaced in one step.
 
     Raises:
         OutputError: the picture cannot be written.

@@ -156,7 +156,6 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
     """Read a scan from a file of any format that we know.
 
     Args:
-        path: the file.
         index: number of the scan in the file, from 0.
         bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
 

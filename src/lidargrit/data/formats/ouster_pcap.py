@@ -176,7 +176,6 @@ def _open_once(
 
 
 def _metadata_of(path: Path) -> Path:
-    """Find the metadata of a recording."""
     metadata = path.with_suffix(".json")
     if metadata.is_file():
         return metadata

@@ -111,7 +111,6 @@ class _Header:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of one point."""
         return sum(size * count for size, count in zip(self.sizes, self.counts, strict=True))
 
     def column_names(self) -> list[str]:

@@ -178,7 +178,6 @@ def _lines(data: bytes, line_end: bytes, path: Path) -> tuple[list[list[str]], i
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[Element]:
-    """Return every element with its properties."""
     elements: list[Element] = []
     for line in lines:
         match line:

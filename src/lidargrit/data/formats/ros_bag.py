@@ -96,9 +96,7 @@ class _Recording(Protocol):
     notes: tuple[str, ...]
     """Sentences on what is not read."""
 
-    def message(self, index: int) -> Any:
-        """Return one PointCloud2, by its number."""
-        ...
+    def message(self, index: int) -> Any: ...
 
 
 def _open(path: Path, topic: str) -> _Recording:
@@ -132,7 +130,6 @@ def _chosen(topics: Counter[str], path: Path, types: Collection[str], wanted: st
 
     Args:
         topics: number of point clouds of each topic.
-        path: path of the recording.
         types: types of all its messages.
         wanted: topic that the user chose; "" for none.
     """

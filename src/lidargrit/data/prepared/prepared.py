@@ -132,7 +132,6 @@ class PreparedFolder:
         """Read a whole JSON file of bounded size and depth.
 
         Args:
-            name: name of the file.
             kind: required type of the whole, dict or list.
             at_most: largest size, in bytes.
 
@@ -167,11 +166,7 @@ def _is_named(scan: Any) -> bool:
 
 
 class _RemoteBytes:
-    """A file in a store that fsspec knows, such as an S3 bucket.
-
-    Raises:
-        DataError: there is no such file, or the store does not answer, or not to this user.
-    """
+    """A file in a store that fsspec knows, such as an S3 bucket."""
 
     def __init__(self, files: Any, path: str, url: str) -> None:
         self._files, self._path, self._url = files, path, url
@@ -286,7 +281,6 @@ class PreparedImages:
         """Return the images with all fine columns of a sensor, which may be fewer than were prepared.
 
         Args:
-            sensor: sensor whose rays are wanted.
             variant: projection variant that is wanted. The reference's columns cannot be gathered into fewer: it rounds
                 points to the nearest column.
 

@@ -53,7 +53,6 @@ def make_shard(
     """Project the scans of one shard; go on from what an interrupted process has kept of it.
 
     Args:
-        folder: prepared folder.
         spec: description of what the folder will hold.
         shard: number of the shard.
         dataset: source of the scans.

@@ -110,8 +110,6 @@ def image_files(path: Path) -> list[Path]:
 
 
 class _ImageFiles:
-    """Files of range images as a store of images."""
-
     def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
         self._paths, self._sensor = paths, sensor
         self.provenance = Provenance(tuple(str(path.absolute()) for path in paths))

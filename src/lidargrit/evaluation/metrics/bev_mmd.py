@@ -37,7 +37,6 @@ class BevMmd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
             any other variant, and slow (a third of a millisecond for a pair of scans: hours for 5,000 of each).
             The histograms of each are those of ``bev_jsd``. All are in double precision (R2DM's is in single, where a
             number of 1e-4 has three digits).
-        seed: not used.
 
     Source:
         Gretton et al., A kernel two-sample test, JMLR 13, 2012, lemma 6 (unbiased: eq. 3, biased: eq. 5); programs as

@@ -31,7 +31,6 @@ class LidmBevMatching(ImageMetric):
 
     Args:
         variant: ``exact`` only; the toolbox computes the same in single precision.
-        seed: not used.
 
     Source:
         Ran et al., Towards realistic scene generation with LiDAR diffusion models, CVPR 2024; cells and

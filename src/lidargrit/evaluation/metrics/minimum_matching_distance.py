@@ -19,7 +19,6 @@ class MinimumMatchingDistance(CloudMetric):
 
     Args:
         variant: published way to sample points from a scan, see :class:`CloudMetric`.
-        seed: not used.
 
     Source:
         Achlioptas et al., Learning representations and generative models for 3D point clouds, ICML 2018;

@@ -22,7 +22,6 @@ class OneNearestNeighbour(CloudMetric):
 
     Args:
         variant: published way to sample points from a scan, see :class:`CloudMetric`.
-        seed: not used.
 
     Source:
         Lopez-Paz and Oquab, Revisiting classifier two-sample tests, ICLR 2017; Yang et al., PointFlow, ICCV 2019;

@@ -18,9 +18,6 @@ class ToldOfScans(ABC):
     def of(self, images: RangeImage) -> Condition:
         """Return what a generator is told of each image.
 
-        Args:
-            images: batch of range images (B, H, W), as they are learned from.
-
         Raises:
             ConfigError: images that lack what tells it.
         """

@@ -229,7 +229,6 @@ class MaskNetwork(PhaseNetwork):
         Args:
             features: channels of the other network's features.
             width: channels of the layers.
-            sensor: the rays of the range images.
         """
         return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
 

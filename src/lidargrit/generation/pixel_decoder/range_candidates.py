@@ -47,7 +47,6 @@ class RangeCandidates(nn.Module):
     bracket it.
 
     Args:
-        sensor: rays of the range images.
         phases: all phases of the pixel decoder.
         surfaces: whether planes and lines are among the candidates.
         gravity: whether vertical and horizontal planes are among the candidates.

@@ -203,10 +203,6 @@ class Decoder(ConvolutionalDecoder):
 class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
     """The adapted VQ-VAE of LidarGRIT.
 
-    Args:
-        config: sizes and losses.
-        sensor: sensor with the rays and limits of its range images.
-
     Raises:
         ConfigError: the image's rows or columns cannot be halved at every level.
 
@@ -355,7 +351,6 @@ def upright_and_thin(range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, 
     of the first. Ranges are the same within 5 %.
 
     Args:
-        range_m: ranges in metres.
         return_mask: pixels with a return; others are at no range.
     """
     v = torch.where(return_mask, range_m.clamp(min=1e-3).log(), -99.0)

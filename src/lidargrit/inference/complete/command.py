@@ -32,7 +32,6 @@ def complete_scans(
         pattern: choice of the observed pixels.
         output: number and kind of files.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        reporter: receiver of progress and messages.
 
     Returns:
         Number of files.

@@ -76,7 +76,6 @@ class Inputs:
     """The scans of a source, one after the other.
 
     Args:
-        scans: scans of the source.
         reader: projection of points to range images.
         reporter: receiver of how many points of the first scan have a pixel, and of the first doubt about the sensor.
     """
@@ -144,7 +143,6 @@ class ScanReader:
     """How points become a range image.
 
     Args:
-        sensor: sensor of the image.
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
     """
@@ -190,7 +188,6 @@ def images_for(models: Sequence[Model], source: str, settings: ScanSettings, rep
 
     Args:
         models: models and classical methods.
-        source: name of the scans.
         settings: settings of reading and projecting them.
         reporter: receiver of progress and of the warning.
     """

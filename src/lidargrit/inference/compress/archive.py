@@ -40,7 +40,6 @@ class Entry(NamedTuple):
     """A line of the index.
 
     Args:
-        name: name of the scan.
         length: number of bytes of the scan; 0 for one that was left out.
         crc32: CRC-32 checksum of these bytes.
         num_returns: number of returns of the scan.
@@ -69,7 +68,6 @@ def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = 
     Until then scans lie in a folder beside the file, named as the file with ``.unfinished``.
 
     Args:
-        path: file to write.
         header: facts that all scans have in common, as JSON.
         chosen: options that say which scans these are, as JSON, to be kept beside an unfinished file.
 
@@ -212,9 +210,6 @@ class ArchiveWriter:
 
 class Archive:
     """A file of compressed scans, whose index is read at once and whose scans are read when they are asked for.
-
-    Args:
-        path: path of the file.
 
     Attributes:
         index_crc32: checksum of the index, which tells two files of scans with the same names apart.

@@ -49,7 +49,6 @@ class Inspection:
 
     Args:
         scan: scan that was projected.
-        sensor: sensor whose rays the image has.
         method: projection method, ``spherical`` or ``unfolding``.
         variant: variant of the projection, ``exact`` or ``reference``.
         fate: index into FATES (n,) of every point.

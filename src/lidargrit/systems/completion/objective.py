@@ -37,7 +37,6 @@ class CompletionObjective(Objective):
 
     Args:
         network: network that is trained.
-        sensor: sensor whose range images it completes.
     """
 
     additions = frozenset({"labels", "reflectance"})

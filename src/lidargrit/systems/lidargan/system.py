@@ -139,7 +139,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         Args:
             files: file of the program; code in it is not run.
             config: rows of the image.
-            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: another file, or a model of another form.

@@ -196,7 +196,6 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         Args:
             files: checkpoint of the program; code in it is not run.
             config: settings that the file does not tell.
-            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: another file, or a model of another form.

@@ -177,9 +177,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
         Args:
             condition: observed part of the scans; None for new ones.
-            rngs: random generators on the CPU, one for each scan of a batch.
             count: number of scans to return.
-            sampling: settings of sampling.
         """
         self.check_choice(sampling.mask, sampling.pixels())
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])

@@ -203,7 +203,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         Args:
             files: file of the program; code in it is not run.
             config: rows of the image and settings of the objective.
-            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: another file, or a model of another form, such as one of three coordinates.

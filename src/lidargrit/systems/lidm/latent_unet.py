@@ -71,7 +71,6 @@ class LatentUnet(Network):
     """Predicts the noise in latents; azimuth wraps.
 
     Args:
-        config: sizes of the network.
         latent_channels: number of channels of the input and of the output.
         grid_size: rows and columns of the latents.
 

@@ -104,11 +104,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         return _BATCH
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: NoSampling) -> RangeImage:
-        """Sample every pixel by itself.
-
-        Raises:
-            CheckpointError: nothing was counted yet.
-        """
+        """Sample every pixel by itself."""
         if not int(self.scans):
             raise CheckpointError("a generator that has counted no scan", "one that has", "call fit_statistics first")
         edges = self._edges_m().to(self.counts.device)

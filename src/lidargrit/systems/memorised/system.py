@@ -82,11 +82,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
         return generator.eval()
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
-        """Return the scan of each seed: as many seeds in a row as there are scans give each of them once.
-
-        Raises:
-            CheckpointError: nothing was kept yet.
-        """
+        """Return the scan of each seed: as many seeds in a row as there are scans give each of them once."""
         if not int(self.scans):
             raise CheckpointError("a generator that has kept no scan", "one that has", "call fit_statistics first")
         range_m = self.range_m[torch.tensor([seed % int(self.scans) for seed in seeds])]

@@ -45,7 +45,6 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> R2flowCheckpoint:
     """Read sizes, settings and weights; no network is built, and no code in the file is run.
 
     Args:
-        path: file of the program.
         sensor: sensor whose limits the ranges of the images must have.
 
     Raises:

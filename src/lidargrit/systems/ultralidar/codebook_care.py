@@ -56,7 +56,6 @@ class CodebookCare(nn.Module):
             codes: codes of the codebook, changed in place.
             latents: latents of the step, of this process.
             tokens: index of the code that each of them chose.
-            rng: source of random numbers.
         """
         counts = torch.zeros(len(codes), device=codes.device).index_add_(0, tokens, torch.ones_like(tokens).float())
         used = sum_over_processes(counts) > 0

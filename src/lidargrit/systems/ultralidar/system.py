@@ -143,7 +143,6 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
 
         Args:
             seeds: one for each scan, from 0 to 2^32 - 1.
-            sampling: settings of sampling; its defaults if not given.
 
         Raises:
             ConfigError: no seed or one out of bounds, or settings of another generator.

@@ -54,7 +54,6 @@ def read_ultralidar_checkpoint(path: Path, sizes: VoxelAutoencoderConfig) -> Ult
     """Read sizes and weights; no network is built, and no code in the file is run.
 
     Args:
-        path: file of the program.
         sizes: cells of the model, which the file does not tell.
 
     Raises:

@@ -124,7 +124,6 @@ def images_of_voxels(
     Args:
         occupied: voxels of each scan.
         grid: cells of the box.
-        sensor: sensor whose rays the pixels are.
         variant: ``exact``, or ``reference`` for a picture of the clouds that UltraLiDAR's program writes: x and y are
             swapped, and the lower corner stands for the centre.
     """
@@ -180,7 +179,6 @@ class _Rays:
         """Distances along the ray at which it enters and leaves its voxel."""
 
     def advance(self) -> None:
-        """Move on to the next voxels."""
         self._moved = self.exit_m < self._end_m
         step = (self._next_m == self.exit_m) & self._moved
         self.voxel = self.voxel + (self._voxels * step).sum(dim=0)

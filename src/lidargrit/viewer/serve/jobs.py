@@ -47,7 +47,6 @@ class JobQueue:
     Args:
         runs: folders of finished runs.
         folder: an empty folder for uploads and results; the caller removes it.
-        device: device of the networks; "" for a GPU if there is one.
         limits: bounds on what may be asked for.
 
     Raises:

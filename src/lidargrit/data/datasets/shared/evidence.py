@@ -17,7 +17,6 @@ def contradicts_hdl64e(path: Path, form: type[ScanFormat]) -> bool:
     """Return whether the points of a scan cannot be an HDL-64E's; False where too few tell.
 
     Args:
-        path: file of a scan.
         form: format of that file.
     """
     try:

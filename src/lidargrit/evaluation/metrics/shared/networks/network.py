@@ -34,7 +34,6 @@ class PretrainedNetwork:
     Args:
         name: name of the network, one of ``NETWORKS``.
         path: file with its weights.
-        device: device on which it computes, such as "cuda".
 
     Raises:
         WeightsError: the file is not to be had, or not of this network.
@@ -81,9 +80,6 @@ def load_network(
 
     Args:
         name: name of the network, one of ``NETWORKS``.
-        weights: file with its weights; found or fetched if not given.
-        device: device on which it computes, such as "cuda".
-        reporter: receives messages and the progress of a download.
 
     Raises:
         WeightsError: the file is not to be had, or not of this network.
