@@ -43,7 +43,7 @@ def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorMod
 
     Args:
         options: parsed options of one of the three verbs.
-        task: its work on each scan.
+        task: the work on each scan.
         sensor: sensor that is named for a classical method, which gives whole clouds all of its columns; a run has its
             own.
     """

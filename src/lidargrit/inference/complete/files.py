@@ -98,8 +98,8 @@ def write_completions(
 ) -> Written:
     """Complete every scan and write it; files that are there already are not written again.
 
-    With one completion of each scan the files lie in ``out``, with several in ``out/completion_0`` and so on, each
-    a whole set of scans. ``completed.json`` says how they were made, and ``sensor.json`` on which rays points lie.
+    With several completions of each scan the files lie in ``out/completion_0`` and so on, each a whole set of scans.
+    ``completed.json`` says how they were made, and ``sensor.json`` on which rays points lie.
 
     Args:
         inputs: scans of the user.
@@ -116,13 +116,12 @@ def write_completions(
     """
     inputs.check_output(out)
     files, facts = _files(inputs, str(facts["source"]), output), facts | _facts(model, output)
-    identities = {file: inputs.identity(index) for (index, _), file in files.items()}
-    left_out, told_labels = set[int](), False
+    identities, left_out = {file: inputs.identity(index) for (index, _), file in files.items()}, set[int]()
     missing = [job for job, file in files.items() if not (out / file).exists()]
-    skipped = left_out if config.bad_scans == "skip" else None
-    jobs = _jobs(inputs, missing, model, task, output, skipped, reporter)
+    jobs = _jobs(inputs, missing, model, task, output, left_out if config.bad_scans == "skip" else None, reporter)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, np.zeros(3, dtype=np.int64)
+    told_labels = False
     with (
         claim_folder(out),
         claimed_scans(out / "completed.json", {**facts, "scans": identities}) as files_left_out,
@@ -132,8 +131,7 @@ def write_completions(
             for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
                 file = files[job.index, job.turn]
                 if output.probability and job.turn == 0:
-                    share = _return_share(model, job, output)
-                    write_array(out / f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}", share)
+                    write_array(out / _probability_file(file), _return_share(model, job, output))
                 if sensor_file is None:
                     write_array(out / file, images.range_m[0])
                     kept_labels = images.label is None
@@ -251,6 +249,10 @@ def _return_share(model: Model, job: _Job, output: OutputConfig) -> Float[Tensor
         seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += complete_images(model, condition, seeds).return_mask.float().sum(0)
     return total / output.probability
+
+
+def _probability_file(file: str) -> str:
+    return f"{file.removesuffix(Path(file).suffix)}{PROBABILITY}"
 
 
 def _folder(turn: int, count: int) -> str:
