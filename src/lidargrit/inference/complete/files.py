@@ -198,8 +198,8 @@ def _jobs(
 
 
 def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
-    """Group jobs that follow one another; a batch has reflectance, or labels, only if all of its scans have them."""
-    for _, alike in groupby(jobs, lambda job: (job.condition.reflectance is None, job.condition.label is None)):
+    """Group jobs that follow one another; scans of a batch have the same planes."""
+    for _, alike in groupby(jobs, lambda job: job.condition.planes.keys()):
         while batch := list(islice(alike, at_most)):
             yield batch
 

@@ -61,7 +61,7 @@ class InputScan:
         own = self.points
         at = self.point_of_pixel[kept]
         added = completed.return_mask & ~kept
-        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.reflectance, completed.label)
+        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.planes)
         rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
         reflectance = None if own.reflectance is None else own.reflectance[at]
         whole = Scan(
