@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
@@ -39,6 +39,8 @@ class Scan:
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
             largest value decided; 0 elsewhere.
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
+        time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
+        pose: matrix from the sensor's frame to that of the recording, kept in 64 bits; None if it is not known.
 
     Raises:
         ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
@@ -51,6 +53,8 @@ class Scan:
     source: str = "a scan"
     full_scale: int = 0
     notes: tuple[str, ...] = ()
+    time_s: float | None = None
+    pose: Float64[Tensor, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         if len(self) == 0:
