@@ -347,7 +347,5 @@ def test_a_sample_that_lacks_the_reflectance_of_those_beside_it_is_not_read_with
         np.savez(tmp_path / f"{seed:08d}.npz", range_m=pixels, **more)
     images = read_samples(tmp_path)
     assert images.batch([0, 1]).reflectance is not None
-    with pytest.raises(
-        DataError, match=r"sample 00000002 without reflectance; wanted what the first"
-    ):
+    with pytest.raises(DataError, match=r"sample 00000002 without reflectance; wanted what the first"):
         images.batch([1, 2])

@@ -1,7 +1,5 @@
 """Range images on disk → batches in memory, of only the images that are asked for."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +22,6 @@ class Pixels(NamedTuple):
     """The pixels of one image.
 
     Args:
-        range_m: range in metres, 0 where there is no return.
         planes: further planes that are known, by names of :data:`~lidargrit.scans.planes.PLANES`.
     """
 
@@ -48,7 +45,7 @@ class Provenance:
     fingerprints: tuple[str, ...] = ()
     range_fingerprints: tuple[str, ...] = ()
 
-    def overlap(self, other: Provenance) -> str:
+    def overlap(self, other: "Provenance") -> str:
         """Return in a few words what two sets share; "" if they share nothing that is known.
 
         Two scans are the same if their files, their pixels or their ranges are. Scans of one drive show the same
@@ -85,7 +82,6 @@ class RangeImages:
     """Range images of one sensor, in one or more stores, numbered through.
 
     Args:
-        sensor: sensor of the images that are returned.
         stores: sources of images that are as wide as the sensor's, or that have all of its fine columns.
     """
 
@@ -95,7 +91,7 @@ class RangeImages:
         self._ends = list(accumulate(len(store) for store in self._stores))
 
     @classmethod
-    def joined(cls, sensor: SensorModel, parts: Sequence[RangeImages]) -> RangeImages:
+    def joined(cls, sensor: SensorModel, parts: "Sequence[RangeImages]") -> "RangeImages":
         """Join the images of several sets into one set, in their order."""
         return cls(sensor, [store for part in parts for store in part._stores])
 

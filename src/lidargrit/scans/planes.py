@@ -1,7 +1,5 @@
 """What a range image may know of every pixel beside its range: the name of a plane → its type and meaning."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, NamedTuple

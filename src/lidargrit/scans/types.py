@@ -4,8 +4,6 @@ Each is valid once it exists. Ranges are always metres and the return mask is al
 tensors live inside one model.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -158,7 +156,7 @@ class RangeImage:
         return_mask: Bool[Tensor, "*batch H W"],
         sensor: SensorModel,
         planes: Mapping[str, Shaped[Tensor, "*batch H W"]] = NO_PLANES,
-    ) -> RangeImage:
+    ) -> "RangeImage":
         """Make a range image of a clean range and a mask: planes of returns are set to 0 where nothing returned."""
         kept = {
             name: torch.where(return_mask, pixels, 0) if PLANES[name].of_returns else pixels
@@ -167,17 +165,17 @@ class RangeImage:
         return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept)
 
     @classmethod
-    def stack(cls, images: Sequence[RangeImage]) -> RangeImage:
+    def stack(cls, images: "Sequence[RangeImage]") -> "RangeImage":
         """Make one batch of single images of one sensor; a plane is kept if every image has it."""
         return cls._joined(images, torch.stack)
 
     @classmethod
-    def cat(cls, batches: Sequence[RangeImage]) -> RangeImage:
+    def cat(cls, batches: "Sequence[RangeImage]") -> "RangeImage":
         """Make one batch of several batches of one sensor; a plane is kept if every batch has it."""
         return cls._joined(batches, torch.cat)
 
     @classmethod
-    def _joined(cls, images: Sequence[RangeImage], join: Callable[[list[Tensor]], Tensor]) -> RangeImage:
+    def _joined(cls, images: "Sequence[RangeImage]", join: Callable[[list[Tensor]], Tensor]) -> "RangeImage":
         return cls(
             join([image.range_m for image in images]),
             join([image.return_mask for image in images]),
@@ -195,22 +193,22 @@ class RangeImage:
         """Class of what returned by SemanticKITTI's numbers, 0 where there is none; None if no class is known."""
         return self.planes.get("label")
 
-    def with_planes(self, **changed: Shaped[Tensor, "*batch H W"] | None) -> RangeImage:
+    def with_planes(self, **changed: Shaped[Tensor, "*batch H W"] | None) -> "RangeImage":
         """Return the image with some of its planes changed, by name, or taken away by None."""
         return replace(self, planes=planes_of(**{**self.planes, **changed}))
 
     def __len__(self) -> int:
         return self.range_m.shape[0] if self.range_m.ndim > 2 else 1
 
-    def __getitem__(self, index: int | slice | list[int]) -> RangeImage:
+    def __getitem__(self, index: int | slice | list[int]) -> "RangeImage":
         """Return one image of a batch, or a batch of some of its images."""
         return self.mapped(lambda pixels: pixels[index])
 
-    def to(self, device: torch.device | str) -> RangeImage:
+    def to(self, device: torch.device | str) -> "RangeImage":
         """Return the image with its pixels on another device."""
         return self.mapped(lambda pixels: pixels.to(device))
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> RangeImage:
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "RangeImage":
         """Return the image in which range, mask and whatever else it has are changed alike."""
         return replace(
             self,
@@ -318,7 +316,7 @@ class ScanBits:
     expected: Float[Tensor, "B H W"] | None = None
 
     @classmethod
-    def cat(cls, batches: Sequence[ScanBits]) -> ScanBits:
+    def cat(cls, batches: "Sequence[ScanBits]") -> "ScanBits":
         """Make one batch of several batches of one model, by one step."""
         first = batches[0]
         parts = {

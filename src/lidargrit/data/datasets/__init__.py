@@ -1,7 +1,5 @@
 """Data sets of scans, recorded and simulated: "NAME:ROOT:SPLIT" → :class:`ScanDataset`."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -133,7 +131,7 @@ class ScanDataset(ABC):
         """
         return Motion()
 
-    def windows(self, frames: int) -> list[Window]:
+    def windows(self, frames: int) -> "list[Window]":
         """Return all runs of scans that follow one another in one recording, in order of time.
 
         Each run begins one scan after the one before it. Scans whose time is not known are in none. Where a recording

@@ -1,7 +1,5 @@
 """The files of one KITTI sequence, ``times.txt``, ``poses.txt``, ``calib.txt`` → when and where each scan was made."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 
