@@ -46,7 +46,7 @@ class Store:
         return 12
 
     def read(self, index):
-        return Pixels(self.range_m[index].numpy(), self.reflectance[index].numpy())
+        return Pixels(self.range_m[index].numpy(), {"reflectance": self.reflectance[index].numpy()})
 
 
 IMAGES = RangeImages(SENSOR, [Store()])

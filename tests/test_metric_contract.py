@@ -70,7 +70,7 @@ def scenes(seed, count=10, walls=6, drop_share=0.1, noise_m=0.0):
     mask &= (noisy_m >= SENSOR.range_min_m) & (noisy_m <= SENSOR.range_max_m)
     reflectance = ((range_m / 100 + drop_share) + noise / 50).clamp(0, 1)
     range_m = noisy_m.clamp(SENSOR.range_min_m, SENSOR.range_max_m)
-    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, torch.where(mask, reflectance, 0))
+    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, {"reflectance": torch.where(mask, reflectance, 0)})
 
 
 def score(name, variant, generated, real, **options):
@@ -133,7 +133,7 @@ def test_grows_with_noise(name, variant):
 def test_order_of_images_does_not_matter(name, variant):
     generated, real = scenes(0), scenes(1)
     order = torch.randperm(10, generator=torch.Generator().manual_seed(0))
-    shuffled = RangeImage(real.range_m[order], real.return_mask[order], SENSOR, real.reflectance[order])
+    shuffled = real[order.tolist()]
     assert close(at_once(name, variant), score(name, variant, generated, shuffled))
 
 
