@@ -256,6 +256,19 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @torch.no_grad()
+    def segment(self, images: RangeImage) -> RangeImage:
+        """Return scans with a label for each return, each computed by itself (capability ``segment``).
+
+        Args:
+            images: batch of range images (B, H, W); labels that they have are not read.
+        """
+        self._require("segment")
+        check_images(images, self.sensor)
+        self.eval()
+        return RangeImage.cat([self._segment(image) for image in one_by_one(images.to(self.device))])
+
+    @final
+    @torch.no_grad()
     def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
         """Return the negative log-likelihood of each scan in bits, each computed by itself (capability ``likelihood``).
 
@@ -292,6 +305,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:
         """Encode and decode a batch of one scan."""
+        raise NotImplementedError
+
+    def _segment(self, images: RangeImage) -> RangeImage:
+        """Label a batch of one scan."""
         raise NotImplementedError
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
