@@ -20,7 +20,7 @@ from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, completed_lattices
 from lidargrit.generation.tokenizers import Tokenizer
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit
 
@@ -45,7 +45,7 @@ def around_true_pixels(
             observed[(..., *given.pixels)] = True
         rngs = [torch.Generator().manual_seed(seed + first + index) for index in range(len(some))]
         decoded = tokenizer.decode(tokenizer.encode(some))
-        found.append(pixels.sample(decoded, rngs, sampling, Condition.of_pixels(some, observed)))
+        found.append(pixels.sample(decoded, rngs, sampling, Observed.of_pixels(some, observed)))
     return RangeImage.cat(found)
 
 

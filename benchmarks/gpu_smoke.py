@@ -12,7 +12,8 @@ import torch
 from lidargrit.api import load
 from lidargrit.core import discovery
 from lidargrit.generation.generator import Generator, load_class
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Nothing, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images
@@ -56,19 +57,19 @@ def two_steps(cls: type[Generator], device: torch.device) -> str:
         for step in range(2):
             for player in objective.players or ("",):
                 rng = torch.Generator(device).manual_seed(step)
-                loss = objective(images.to(device), rng, player)["loss"]
+                loss = objective(Example(images.to(device)), rng, player)["loss"]
                 loss.backward()
                 optimiser.step()
                 optimiser.zero_grad()
         losses.append(f"{stage} {float(loss.detach()):.3g}")
         generator.load_stage(stage, objective.cpu().eval())
     generator.to(device).eval()
-    if cls.needs_condition:
+    if Nothing not in generator.takes:
         surfaces = "pixels" not in generator.conditions
-        some = Condition.of_surfaces(images) if surfaces else Condition.of_pixels(images, images.range_m > 20)
+        some = Observed.of_surfaces(images) if surfaces else Observed.of_pixels(images, images.range_m > 20)
         scan = generator.complete(some[:1].to(device), [_SEED])
     else:
-        scan = generator.sample([_SEED], cls.quickest_sampling())
+        scan = generator.sample([_SEED], sampling=cls.quickest_sampling())
     return f"{'; '.join(losses)}; {float(scan.return_mask.float().mean()):.0%} of the rays return"
 
 

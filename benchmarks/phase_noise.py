@@ -20,6 +20,7 @@ from lidargrit.data.sources import open_images
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
 from lidargrit.generation.pixel_decoder.pixel_networks import MaskNetwork
+from lidargrit.scans.example import Example
 
 _AT_ONCE = 4
 
@@ -44,7 +45,8 @@ def main() -> None:
     noise.sums.zero_()
     rng = torch.Generator().manual_seed(0)
     for first in range(0, len(images), _AT_ONCE):
-        objective(images.batch(range(first, min(first + _AT_ONCE, len(images)))), rng)
+        some = images.batch(range(first, min(first + _AT_ONCE, len(images))))
+        objective(Example(some), rng)
     _print_shares(noise)
     model.load_stage(options.stage, objective)
     folder = locate(options.run)

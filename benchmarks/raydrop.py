@@ -24,7 +24,7 @@ from lidargrit.data.sources import open_images
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES
 from lidargrit.evaluation.realism import distance, drop_independently, pair_of
 from lidargrit.generation.generator import load
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import observe
 from lidargrit.systems.raydrop.system import Raydrop
@@ -52,7 +52,7 @@ def main() -> None:
         redrawn.append(RangeImage.masked(of_clean.range_m, of_clean.return_mask & again, model.sensor))
     surfaces, others = RangeImage.stack(clean[: options.count]), RangeImage.stack(true[options.count :])
     measured = RangeImage.stack(true[: options.count])
-    dropped = model.complete(Condition.of_surfaces(surfaces), range(options.count))
+    dropped = model.complete(Observed.of_surfaces(surfaces), range(options.count))
     independent = copy.deepcopy(model)
     independent.raydrop.mask.noise.sums.zero_()
     with torch.no_grad():
@@ -64,7 +64,7 @@ def main() -> None:
         "the simulator, sampled again": RangeImage.stack(redrawn[: options.count]),
         "model": dropped,
         "model, pixels of a phase independent": independent.complete(
-            Condition.of_surfaces(surfaces), range(options.count)
+            Observed.of_surfaces(surfaces), range(options.count)
         ),
         "its probabilities, pixel by pixel": RangeImage.masked(surfaces.range_m, alone, model.sensor),
         "Bernoulli": drop_independently(surfaces, float(measured.return_mask.float().mean())),
@@ -78,7 +78,7 @@ def main() -> None:
         if options.real:
             real = open_images(options.real, model.sensor, DataConfig(bad_points="drop"))
             true = real.batch(range(len(real)))
-            again = model.complete(Condition.of_surfaces(true), range(len(true)))
+            again = model.complete(Observed.of_surfaces(true), range(len(true)))
             print("\nreflectance of real scans\n" + reflectance_table(again, true, others))
 
 

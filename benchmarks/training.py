@@ -29,6 +29,7 @@ from lidargrit.data.sources import load_range_images
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
+from lidargrit.scans.example import Example
 from lidargrit.training import training_flops
 from lidargrit.training.stage import StageTraining
 
@@ -80,7 +81,7 @@ def plain(generator: Generator, stage: str, preset: Preset, images: RangeImages,
     with sdpa_kernel(SDPBackend.MATH):
         for step in range(UNTIMED + steps):
             begun = clock() if step == UNTIMED else begun
-            loss = objective(batch, torch.Generator(DEVICE).manual_seed(step))["loss"]
+            loss = objective(Example(batch), torch.Generator(DEVICE).manual_seed(step))["loss"]
             if stage == "tokenizer":
                 with torch.no_grad():
                     critic(batch.range_m[:, None])

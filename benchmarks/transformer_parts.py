@@ -230,7 +230,7 @@ class Tokens:
     def of_seed(self, seed: int, scans: int) -> Int[Tensor, "N T"]:
         """Return the tokens of as many training scans, in the order and with the augmentation of a seed."""
         batches = Batches(self._train, BATCH, ("flip",), any_columns=True, seed=seed)
-        return torch.cat([self._encode(images) for images in batches.stream(0, scans)])
+        return torch.cat([self._encode(example.images) for example in batches.stream(0, scans)])
 
     def rolls_with_images(self) -> float:
         """Return how many tokens of some scans, rolled by one to all cells, are those of the images rolled alike."""

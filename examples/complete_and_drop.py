@@ -12,7 +12,7 @@ import lidargrit
 from lidargrit.core.errors import ConfigError, LidarGritError
 from lidargrit.evaluation.realism import simulate_pair
 from lidargrit.inference.complete.patterns import Pattern
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import fill
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
@@ -28,17 +28,17 @@ def main(folder: Path, run: str = "pretrained") -> None:
         raise ConfigError(f"{run}, a model of {model.public_name()!r}", "one of LidarGRIT", "name another run")
     completes = lidargrit.load(run, "complete")
     clean, true = (RangeImage.stack([image]) for image in simulate_pair(STREET, model.sensor))
-    known = Condition.of_pixels(true, Pattern("sector:45,315").mask(true[0])[None])
+    known = Observed.of_pixels(true, Pattern("sector:45,315").mask(true[0])[None])
     panels = [("a simulated scan", true[0]), ("what is known of it", known.images[0])]
     panels.append(("filled in by triangulation", fill("triangulation", known)[0]))
-    sampled = model.complete(Condition.cat([known] * SAMPLES), range(SAMPLES), TokenSampling())
+    sampled = model.complete(Observed.cat([known] * SAMPLES), range(SAMPLES), TokenSampling())
     panels += [(f"sampled by the model, seed {seed}", sampled[seed]) for seed in range(4)]
     if isinstance(completes, LidarGrit):
         panels.append(("sampled by the model, seed 4", sampled[4]))
     else:
         panels.append(("the best guess of its network for completion", completes.complete(known, [0])[0]))
     plot(panels, folder / "completion.png")
-    dropped = model.complete(Condition.cat([Condition.of_surfaces(clean)] * SAMPLES), range(SAMPLES))
+    dropped = model.complete(Observed.cat([Observed.of_surfaces(clean)] * SAMPLES), range(SAMPLES))
     panels = [("clean ranges, as a simulator casts them", clean[0])]
     panels += [(f"after raydrop, seed {seed}", dropped[seed]) for seed in range(2)]
     panels.append(("as the simulator's own sensor drops", true[0]))

@@ -23,7 +23,7 @@ def main(folder: Path, run: str = "pretrained") -> None:
         raise ConfigError(
             f"{run}, which has no pixel decoder", "a run with one", "train the preset lidargrit_compact_pixels"
         )
-    scan, plain = model.sample([SEED])[0], model.sample([SEED], TokenSampling(mask="bernoulli"))[0]
+    scan, plain = model.sample([SEED])[0], model.sample([SEED], sampling=TokenSampling(mask="bernoulli"))[0]
     phases = model.pixels.mask.phases
     panels = []
     for lattice, count in completed_lattices(phases)[-SHOWN:]:

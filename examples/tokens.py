@@ -9,6 +9,7 @@ from matplotlib.colors import LogNorm
 
 import lidargrit
 from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
+from lidargrit.scans.example import Example
 from lidargrit.scans.types import RangeImage
 
 STEPS = 60  # a taste, of one street; the preset `lidargrit_small` takes thousands, of thousands
@@ -37,7 +38,7 @@ def main(folder: Path) -> None:
     tokenizer = Vqvae(config, sensor)
     optimiser = torch.optim.Adam(tokenizer.parameters(), 3e-3)
     for _ in range(STEPS):
-        terms = tokenizer(street, rng)
+        terms = tokenizer(Example(street), rng)
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()

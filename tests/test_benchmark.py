@@ -22,6 +22,7 @@ from lidargrit.evaluation.intervals import Resampling
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
 from lidargrit.nn.flops import flops_of
+from lidargrit.scans.example import Example
 from lidargrit.scans.marks import read_marks
 from lidargrit.training import compute, computing_time, training_flops, with_budget
 from lidargrit.training.compute import uniform_images
@@ -246,7 +247,7 @@ def test_counted_operations_are_those_of_a_step_that_is_computed(preset, stage):
     objective = preset.build_generator().objective(stage).train()
     with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
         images = uniform_images(preset.data.load_sensor(), 2)
-        objective(images, torch.Generator().manual_seed(0))["loss"].backward()
+        objective(Example(images), torch.Generator().manual_seed(0))["loss"].backward()
     counted = training_flops(preset)[stage] / preset.training[stage].scans
     assert counted == pytest.approx(counter.get_total_flops() / 2, rel=1e-6)
 

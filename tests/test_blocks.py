@@ -16,6 +16,7 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import Block, Network, prepare_for_training
 from lidargrit.nn.convolution import wrapped
+from lidargrit.scans.example import Example
 from lidargrit.training import train
 from lidargrit.training.compute import uniform_images
 from tiny_runs import LONG, MODEL, SHORT, SIMULATED
@@ -38,7 +39,7 @@ def gradients(objective: nn.Module) -> tuple[list[torch.Tensor], int]:
     torch.manual_seed(1)
     images = uniform_images(objective.sensor, 2)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        loss = objective.train()(images, torch.Generator().manual_seed(2))["loss"]
+        loss = objective.train()(Example(images), torch.Generator().manual_seed(2))["loss"]
         bytes_kept = sum(kept.values())
     loss.backward()
     found = [parameter.grad for parameter in objective.parameters() if parameter.grad is not None]

@@ -25,7 +25,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.inference.complete import open_model, open_models
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
 from lidargrit.inference.samples import write_samples
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import FILLS, fill
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -74,7 +74,7 @@ def test_a_plane_and_a_wall_are_filled_in(method):
     image = RangeImage.stack([street(SENSOR)])
     observed = torch.zeros_like(image.return_mask)
     observed[:, 1::2] = True
-    done = fill(method, Condition.of_pixels(image, observed))
+    done = fill(method, Observed.of_pixels(image, observed))
     assert torch.equal(done.range_m[observed], image.range_m[observed])
     both = ~observed & image.return_mask & done.return_mask
     assert float(both.float().sum() / (~observed & image.return_mask).float().sum()) > 0.7
@@ -87,7 +87,7 @@ def test_triangles_close_the_circle_and_are_exact_on_a_wall_where_rows_lack():
     image = RangeImage.stack([RangeImage((1 / inverse).float(), torch.ones(64, 32, dtype=torch.bool), SENSOR)])
     observed = torch.ones(1, 64, 32, dtype=torch.bool)
     observed[:, 8:50, :3], observed[:, 8:50, -3:] = False, False  # around the seam
-    done = fill("triangulation", Condition.of_pixels(image, observed))
+    done = fill("triangulation", Observed.of_pixels(image, observed))
     assert torch.allclose(done.range_m, image.range_m, rtol=1e-5)
 
 
@@ -98,7 +98,7 @@ def test_an_edge_is_not_smeared():
     observed = torch.zeros(1, 64, 32, dtype=torch.bool)
     observed[:, :, ::3] = True
     for method in FILLS:
-        assert set(fill(method, Condition.of_pixels(image, observed)).range_m.unique().tolist()) == {5.0, 40.0}
+        assert set(fill(method, Observed.of_pixels(image, observed)).range_m.unique().tolist()) == {5.0, 40.0}
 
 
 def test_samples_that_were_added_are_not_taken_for_those_completed_before(folders, tmp_path, capsys):

@@ -10,7 +10,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.settings import Preset
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
@@ -37,10 +37,10 @@ def scans(count: int) -> RangeImage:
     return RangeImage.masked(range_m, torch.rand(count, 64, 32, generator=rng) < 0.8, SENSOR)
 
 
-def rows_of(images: RangeImage) -> Condition:
+def rows_of(images: RangeImage) -> Observed:
     observed = torch.zeros_like(images.return_mask)
     observed[:, 2::4] = True
-    return Condition.of_pixels(images, observed)
+    return Observed.of_pixels(images, observed)
 
 
 def made() -> CompletionNetwork:
@@ -52,19 +52,19 @@ def test_hints_tell_the_next_return_on_every_side():
     range_m = torch.zeros(1, 64, 32)
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     image = RangeImage(range_m, range_m > 0, SENSOR)
-    hints = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
+    hints = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     above, below, left, right = hints.candidates[0, 3:7, 10, 6].expm1().tolist()
     assert (below, left, right) == pytest.approx((11.0, 5.0, 8.0))
     assert above == pytest.approx(float(hints.candidates[0, 0, 10, 6].expm1()))  # nothing above: as triangulated
     assert hints.maps[0, 9:13, 10, 6].tolist() == pytest.approx([4.0, 10 / 16, 2 / 16, 24 / 16])
-    assert float(hints_of(Condition.nothing(SENSOR, 1)).maps.abs().max()) == 0
+    assert float(hints_of(Observed.nothing(SENSOR, 1)).maps.abs().max()) == 0
 
 
 def test_hints_of_the_mirror_image_are_those_of_mirrored_scans():
     images = scans(1)
-    known = Condition.of_pixels(images, torch.rand(1, 64, 32, generator=torch.Generator().manual_seed(0)) < 0.2)
+    known = Observed.of_pixels(images, torch.rand(1, 64, 32, generator=torch.Generator().manual_seed(0)) < 0.2)
     there = RangeImage(known.range_m.flip(-1), known.return_mask.flip(-1), SENSOR)
-    mirrored, wanted = hints_of(known).mirrored(), hints_of(Condition.of_pixels(there, known.return_observed.flip(-1)))
+    mirrored, wanted = hints_of(known).mirrored(), hints_of(Observed.of_pixels(there, known.return_observed.flip(-1)))
     exact = [
         0,
         1,
@@ -98,7 +98,7 @@ def test_the_likelihood_of_the_mask_counts_unknown_pixels_alone():
     rng = torch.Generator().manual_seed(0)
     estimates = torch.stack([network.mask.nats(point.guide, images.return_mask, rng) for _ in range(40)])
     assert torch.allclose(estimates.mean(0), nats, rtol=0.1)
-    whole = Condition.of_pixels(images, torch.ones_like(images.return_mask))
+    whole = Observed.of_pixels(images, torch.ones_like(images.return_mask))
     point = network(hints_of(whole), whole.return_observed)
     assert network.mask.nats(point.guide, images.return_mask, None).tolist() == [0, 0]
 
@@ -142,11 +142,11 @@ def test_a_bundle_completes_each_scan_by_the_run_for_what_is_known_of_it(tmp_pat
     assert torch.equal(done.range_m, alone.complete(known, [1, 2]).range_m)
     assert not torch.equal(done.range_m, by_tokens.range_m)
     assert torch.equal(bundle.complete(known, [1, 2], TokenSampling()).range_m, by_tokens.range_m)
-    mixed = Condition.cat([known[:1], Condition.nothing(SENSOR, 1), known[1:]])
+    mixed = Observed.cat([known[:1], Observed.nothing(SENSOR, 1), known[1:]])
     together = bundle.complete(mixed, [1, 7, 2])
     assert torch.equal(together.range_m[[0, 2]], done.range_m)
     assert torch.equal(together.range_m[1], tokens.sample([7]).range_m[0])
-    clean = Condition.of_surfaces(scans(1))  # there is no run for it
+    clean = Observed.of_surfaces(scans(1))  # there is no run for it
     assert torch.equal(bundle.complete(clean, [0]).range_m, tokens.complete(clean, [0]).range_m)
     assert locate(tmp_path, "raydrop") == locate(tmp_path) == tmp_path / "lidargrit"
 
@@ -162,7 +162,7 @@ def test_a_bundle_that_names_no_run_that_samples_or_one_elsewhere_is_refused(tmp
 def test_what_only_completes_scans_samples_none():
     for name in ("completion", "raydrop", "interpolation"):
         cls = load_class(name)
-        with pytest.raises(ConfigError, match=rf"a generator '{name}', which has no new scans to sample"):
+        with pytest.raises(ConfigError, match=rf"got no condition for '{name}'; wanted one of type Observed; "):
             cls(cls.smallest_config(SENSOR), SENSOR).sample([0])
 
 

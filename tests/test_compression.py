@@ -81,14 +81,14 @@ def test_a_model_without_tokens_compresses_too(halvings):
     rng = torch.Generator().manual_seed(3)
     for weight in generator.parameters():
         weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
-    codec, image = ScanCodec(generator, 20), generator.sample([0], PixelSampling(1.0, 1.0))
+    codec, image = ScanCodec(generator, 20), generator.sample([0], sampling=PixelSampling(1.0, 1.0))
     compressed, bits = codec.compress(image[0]), float(generator.bits(image, 20).total())
     assert torch.equal(codec.decompress(compressed).range_m, codec.steps.round(image).range_m[0])
     assert 0.99 * bits < 8 * len(compressed) < 1.01 * bits + 72 + 64
 
 
 def test_a_scan_takes_as_many_bits_as_the_model_tells(codec):
-    image = made().sample([0], TokenSampling(range_temperature=1.0, range_noise=1.0))
+    image = made().sample([0], sampling=TokenSampling(range_temperature=1.0, range_noise=1.0))
     compressed, bits = codec.compress(image[0]), made().bits(image, 20)
     expected = float(bits.total()) - float(bits.tokens.sum()) + 8 * 4 * math.log2(8)  # 32 tokens, all as likely
     assert 0.99 * expected < 8 * len(compressed) < 1.01 * expected + 72 + 64  # a head of 72 bits, two words

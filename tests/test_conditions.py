@@ -9,7 +9,7 @@ import torch
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ConfigError, ScanError, UsageError
 from lidargrit.inference.complete.patterns import Pattern
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import fill_from_nearest, fill_lacking
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
@@ -27,32 +27,45 @@ def scans(count: int = 2) -> RangeImage:
 def test_what_was_observed_stands_bit_for_bit_and_the_rest_is_generated():
     images, generated = scans(), RangeImage.masked(torch.full((2, 64, 32), 7.0), scans().return_mask.roll(1), SENSOR)
     observed = torch.rand(2, 64, 32) < 0.3
-    known = Condition.of_pixels(images, observed)
+    known = Observed.of_pixels(images, observed)
     assert known.kinds == {"pixels"}
     done = known.put_into(generated)
     assert torch.equal(done.range_m[observed], images.range_m[observed])
     assert torch.equal(done.range_m[~observed], generated.range_m[~observed])
-    assert Condition.nothing(SENSOR, 2).kinds == frozenset()
-    assert torch.equal(Condition.nothing(SENSOR, 2).put_into(generated).range_m, generated.range_m)
+    assert Observed.nothing(SENSOR, 2).kinds == frozenset()
+    assert torch.equal(Observed.nothing(SENSOR, 2).put_into(generated).range_m, generated.range_m)
 
 
 def test_of_clean_surfaces_only_what_returned_is_kept():
     images = scans()
-    known, generated = Condition.of_surfaces(images), RangeImage.masked(images.range_m + 1, images.return_mask, SENSOR)
+    known, generated = Observed.of_surfaces(images), RangeImage.masked(images.range_m + 1, images.return_mask, SENSOR)
     assert known.kinds == {"surfaces"}  # a beam that meets nothing is known not to return, which is no range
     dropped = RangeImage.masked(generated.range_m, generated.return_mask.roll(1) & generated.return_mask, SENSOR)
     assert torch.equal(known.put_into(dropped).range_m, images.range_m * dropped.return_mask)
 
 
+def test_scans_of_two_sensors_are_no_batch():
+    other = replace(SENSOR, elevation_rad=SENSOR.elevation_rad + 0.01)
+    images, theirs = scans(), replace(scans(), sensor=other)
+    nothing = torch.zeros_like(images.return_mask)
+    for join in (
+        lambda: RangeImage.cat([images, theirs]),
+        lambda: RangeImage.stack([images[0], theirs[0]]),
+        lambda: Observed.cat([Observed.of_pixels(each, nothing) for each in (images, theirs)]),
+    ):
+        with pytest.raises(ConfigError, match="images of the sensors"):
+            join()
+
+
 def test_conditions_that_cannot_be_are_refused():
     images = scans()
     with pytest.raises(ConfigError, match=r"^got observed pixels of shape .*; wanted \(2, 64, 32\) and torch.bool"):
-        Condition.of_pixels(images, torch.ones(1, 64, 32, dtype=torch.bool))
+        Observed.of_pixels(images, torch.ones(1, 64, 32, dtype=torch.bool))
     every = torch.ones(2, 64, 32, dtype=torch.bool)
     with pytest.raises(ScanError, match="an observed range of 0 metres"):
-        Condition(images.range_m, every, images.return_mask, every, SENSOR)
+        Observed(images.range_m, every, images.return_mask, every, SENSOR)
     with pytest.raises(ScanError, match="an observed return of unknown range"):
-        Condition(images.range_m, ~every, images.return_mask, every, SENSOR)
+        Observed(images.range_m, ~every, images.return_mask, every, SENSOR)
 
 
 @pytest.mark.usefixtures("untyped")
@@ -62,14 +75,14 @@ def test_reflectance_labels_and_unknown_pixels_that_cannot_be_are_refused():
     assert bright is not None
     for wrong in (bright * 255, bright - 1, bright * torch.nan):
         with pytest.raises(ScanError, match=r"reflectance is NaN, below 0 or above 1; wanted values in \[0, 1\]"):
-            Condition.of_pixels(replace(images, reflectance=wrong), every)
+            Observed.of_pixels(replace(images, reflectance=wrong), every)
     beyond = torch.where(images.return_mask, bright, 2.0)
     mask = images.return_mask
-    assert len(Condition(images.range_m, mask, mask, mask, SENSOR, beyond)) == 2, "values elsewhere have no influence"
+    assert len(Observed(images.range_m, mask, mask, mask, SENSOR, beyond)) == 2, "values elsewhere have no influence"
     with pytest.raises(ConfigError, match=r"^got labels of type torch.float32; wanted whole numbers"):
-        Condition.of_pixels(replace(images, label=bright), every)
+        Observed.of_pixels(replace(images, label=bright), every)
     with pytest.raises(ConfigError, match=r"^got unknown pixels of .* and type torch.float32; wanted .*torch.bool"):
-        Condition.of_surfaces(images, every.float())
+        Observed.of_surfaces(images, every.float())
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16])
@@ -79,7 +92,7 @@ def test_images_and_conditions_are_kept_in_32_bits(dtype):
     given = replace(images, range_m=images.range_m.to(dtype), reflectance=images.reflectance.to(dtype))
     assert given.range_m.dtype == given.reflectance.dtype == torch.float32
     mask = images.return_mask
-    known = Condition(images.range_m.to(dtype), mask, mask, mask, SENSOR, images.reflectance.to(dtype))
+    known = Observed(images.range_m.to(dtype), mask, mask, mask, SENSOR, images.reflectance.to(dtype))
     assert known.range_m.dtype == known.reflectance.dtype == torch.float32
     assert torch.equal(known.range_m, given.range_m)
 
@@ -151,7 +164,7 @@ def test_the_nearest_observed_pixel_is_that_of_the_smallest_angle_around_the_cir
 def test_what_was_not_observed_has_no_influence_where_nothing_returned():
     none, every = torch.zeros(1, 64, 32, dtype=torch.bool), torch.ones(1, 64, 32, dtype=torch.bool)
     stray = torch.full((1, 64, 32), 0.7)
-    known = Condition(9 * stray, none, none, every, SENSOR, stray, torch.full((1, 64, 32), 50))
+    known = Observed(9 * stray, none, none, every, SENSOR, stray, torch.full((1, 64, 32), 50))
     filled = fill_lacking(RangeImage(9 * stray, every, SENSOR), known)
     assert torch.equal(filled.reflectance, torch.zeros(1, 64, 32))
     assert not filled.label.any()

@@ -10,7 +10,8 @@ import torch
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.nn.latent_search import rate_share, search_latents
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.dusty.raydrop import logistic_noise, straight_through
@@ -62,7 +63,7 @@ def test_coins_fall_by_their_logits_and_pass_the_sigmoids_gradient():
 
 def test_raydrop_has_a_seed_of_its_own():
     generator = made()
-    first, again, other = (generator.sample([4, 5], DustySampling(raydrop_seed=seed)) for seed in (0, 0, 1))
+    first, again, other = (generator.sample([4, 5], sampling=DustySampling(raydrop_seed=seed)) for seed in (0, 0, 1))
     assert torch.equal(first.range_m, again.range_m)
     both = first.return_mask & other.return_mask
     assert 0 < float(both.float().mean()) < float(first.return_mask.float().mean())
@@ -73,8 +74,12 @@ def test_masks_follow_the_logits():
     generator = made()
     with torch.no_grad():
         _, logits = generator.synthesis(generator._latents([4]))
-        assert torch.equal(generator.sample([4], DustySampling(mask="threshold")).return_mask, logits[:, 0] > 0)
-        sampled = torch.stack([generator.sample([4], DustySampling(raydrop_seed=s)).return_mask[0] for s in range(400)])
+        assert torch.equal(
+            generator.sample([4], sampling=DustySampling(mask="threshold")).return_mask, logits[:, 0] > 0
+        )
+        sampled = torch.stack(
+            [generator.sample([4], sampling=DustySampling(raydrop_seed=s)).return_mask[0] for s in range(400)]
+        )
     assert torch.allclose(sampled.float().mean(0), logits[0, 0].sigmoid(), atol=0.13)  # five standard errors
 
 
@@ -95,12 +100,12 @@ def test_the_second_variant_drops_scans_as_a_whole():
 
 def test_the_baseline_reads_far_pixels_as_no_return():
     generator = made(replace(TINY, variant="baseline"), SENSOR.with_columns(64))
-    every = generator.sample([0, 1], DustySampling(tolerance=0.0))
+    every = generator.sample([0, 1], sampling=DustySampling(tolerance=0.0))
     limit_m = 1 / (0.008 * (1 / 0.9 - 1 / 120) + 1 / 120)
     assert limit_m == pytest.approx(58.3, abs=0.1)  # what the docstring says
     near = generator.sample([0, 1])
     assert torch.equal(near.return_mask, every.range_m < limit_m)
-    coarse = generator.sample([0, 1], DustySampling(tolerance=0.5))
+    coarse = generator.sample([0, 1], sampling=DustySampling(tolerance=0.5))
     assert torch.equal(
         coarse.return_mask, (every.range_m < 1 / (0.5 * (1 / 0.9 - 1 / 120) + 1 / 120)) & every.return_mask
     )
@@ -112,7 +117,7 @@ def test_what_is_generated_at_the_far_limit_is_no_return():
     generator = made()
     generator.synthesis.return_head.bias.data.fill_(30.0)
     assert bool(generator.sample([0]).return_mask.all())
-    assert float(generator.sample([0], DustySampling(tolerance=0.5)).return_mask.float().mean()) < 1
+    assert float(generator.sample([0], sampling=DustySampling(tolerance=0.5)).return_mask.float().mean()) < 1
     generator.synthesis.range_head.bias.data.fill_(-30.0)
     assert not bool(generator.sample([0]).return_mask.any())
 
@@ -137,7 +142,7 @@ def game_of(**settings):
 
 
 def loss_of(game, images, phase):
-    return float(game(images, rng(), phase)["loss"].detach())
+    return float(game(Example(images), rng(), phase)["loss"].detach())
 
 
 def rng():
@@ -158,7 +163,7 @@ def test_losses_are_the_formulas(images):
 def test_the_penalty_is_the_squared_gradient_at_real_images(images):
     plain, game = game_of(penalty_weight=0.0), game_of(penalty_weight=3.0, penalty_every=2)
     without = loss_of(plain, images, "discriminator")
-    first, second = (game(images, rng(), "discriminator") for _ in range(2))
+    first, second = (game(Example(images), rng(), "discriminator") for _ in range(2))
     assert "squared_gradient" not in first
     assert float(first["loss"].detach()) == pytest.approx(without, rel=1e-6)
     wanted = without + 3.0 / 2 * 2 * float(second["squared_gradient"].detach())
@@ -168,10 +173,10 @@ def test_the_penalty_is_the_squared_gradient_at_real_images(images):
     step = 1e-5 * torch.eye(real.numel(), dtype=torch.float64).view(-1, 1, *real.shape[-2:])
     with torch.no_grad():
         slopes = torch.cat([(judge(real + part) - judge(real - part)) / 2e-5 for part in step.split(256)])
-    one = game_of(penalty_weight=3.0, penalty_every=1)(images[:1], rng(), "discriminator")["squared_gradient"]
+    one = game_of(penalty_weight=3.0, penalty_every=1)(Example(images[:1]), rng(), "discriminator")["squared_gradient"]
     assert float(one.detach()) == pytest.approx(float(slopes.square().sum()), rel=1e-4)
     assert game.turns == 2
-    game.eval()(images, rng(), "discriminator")  # no penalty, so that it can be validated without gradients
+    game.eval()(Example(images), rng(), "discriminator")  # no penalty, so that it can be validated without gradients
     assert game.turns == 2
 
 
@@ -186,11 +191,11 @@ def test_each_player_moves_by_its_own_loss_against_the_other_as_it_stands(images
     }
     start = {name: weight.clone() for name, weight in slow.state_dict().items()}
     for seed in range(3):
-        terms = engine.step(images, seed, gradient_clip=0.0)
+        terms = engine.step(Example(images), seed, gradient_clip=0.0)
         total = 0.0
         for phase, optimiser in optimisers.items():
             slow.zero_grad()
-            loss = slow(images, torch.Generator().manual_seed(seed), phase)["loss"]
+            loss = slow(Example(images), torch.Generator().manual_seed(seed), phase)["loss"]
             loss.backward()
             optimiser.step()
             total += float(loss.detach())
@@ -207,7 +212,7 @@ def test_a_player_whose_loss_is_not_finite_does_not_move(images):
     engine = Engine("fp32")
     engine.set_up(game, torch.optim.SGD(game.parameters(), lr=1.0))
     before = {name: weight.clone() for name, weight in game.named_parameters()}
-    assert not bool(engine.step(images, 0, gradient_clip=1.0)["loss"].isfinite())
+    assert not bool(engine.step(Example(images), 0, gradient_clip=1.0)["loss"].isfinite())
     assert all(torch.equal(weight, before[name]) for name, weight in game.named_parameters() if "bias" not in name)
     assert all(bool(weight.isfinite().all()) for weight in game.discriminator.parameters())
 
@@ -232,10 +237,10 @@ def test_the_searchs_rate_rises_stays_and_falls():
 
 def test_a_scan_that_the_network_drew_is_found_again():
     generator, sampling = made(), DustySampling(search_steps=150, mask="threshold")
-    target = generator.sample([50, 51], sampling)
+    target = generator.sample([50, 51], sampling=sampling)
     clean = InverseRange(NARROW)
     errors = []
-    for found in (generator.invert(target, [1, 2], sampling), generator.sample([1, 2], sampling)):
+    for found in (generator.invert(target, [1, 2], sampling), generator.sample([1, 2], sampling=sampling)):
         both = found.return_mask & target.return_mask
         errors.append(float((clean.encode(found) - clean.encode(target))[:, 0][both].abs().mean()))
     assert errors[0] < 0.3 * errors[1]
@@ -244,16 +249,16 @@ def test_a_scan_that_the_network_drew_is_found_again():
 
 def test_completion_keeps_what_was_observed():
     generator, sampling = made(), DustySampling(search_steps=150)
-    whole = generator.sample([50, 51], sampling)
+    whole = generator.sample([50, 51], sampling=sampling)
     observed = torch.zeros_like(whole.return_mask)
     observed[:, ::2] = True
     hidden = RangeImage.masked(whole.range_m, whole.return_mask & observed, NARROW)
-    known = [Condition.of_pixels(images, observed) for images in (whole, hidden)]
+    known = [Observed.of_pixels(images, observed) for images in (whole, hidden)]
     found, again = (generator.complete(each, [1, 2], sampling) for each in known)
     assert torch.equal(found.range_m, again.range_m)  # what was not observed is not looked at
     assert torch.equal(found.range_m[observed], whole.range_m[observed])
     both = ~observed & whole.return_mask & found.return_mask
-    guess = generator.sample([1, 2], sampling)
+    guess = generator.sample([1, 2], sampling=sampling)
     also = both & guess.return_mask
     error, of_guess = ((1 / image.range_m - 1 / whole.range_m)[also].abs().mean() for image in (found, guess))
     assert float(error) < 0.5 * float(of_guess)
@@ -263,6 +268,6 @@ def test_a_gradient_reaches_every_weight_of_the_player_alone(images):
     game = made(replace(TINY, variant="dusty_2")).objective("adversarial").train()
     for phase, mine in (("discriminator", "discriminator."), ("generator", "synthesis.")):
         game.zero_grad()
-        game(images, rng(), phase)["loss"].backward()
+        game(Example(images), rng(), phase)["loss"].backward()
         reached = {name for name, weight in game.named_parameters() if weight.grad is not None}
         assert reached == {name for name, _ in game.named_parameters() if name.startswith(mine)}

@@ -16,7 +16,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.generation.facts import CAPABILITIES
 from lidargrit.generation.generator import Generator, load, load_class
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Nothing, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 
@@ -65,16 +66,16 @@ def made(name):
 def known_of(generator, images):
     """Return what is known of scans, of a kind that the generator takes: every fourth row, or all surfaces."""
     if "pixels" not in generator.conditions:
-        return Condition.of_surfaces(images)
+        return Observed.of_surfaces(images)
     observed = torch.zeros(images.range_m.shape, dtype=torch.bool)
     observed[:, ::4] = True
-    return Condition.of_pixels(images, observed)
+    return Observed.of_pixels(images, observed)
 
 
 def scans_of(generator, seeds, sampling):
     """Return new scans, or completions of one scan by a generator that has no new ones."""
-    if not generator.needs_condition:
-        return generator.sample(seeds, sampling)
+    if Nothing in generator.takes:
+        return generator.sample(seeds, sampling=sampling)
     return generator.complete(known_of(generator, IMAGES.batch([0] * len(seeds))), seeds, sampling)
 
 
@@ -145,7 +146,7 @@ def test_threads_and_inference_mode_change_no_scan(name):
 
 def test_streams_the_same_scans_without_end(name):
     generator, sampling = made(name)
-    if generator.needs_condition:
+    if Nothing not in generator.takes:
         return
     streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling), 11))
     assert same(RangeImage.stack(streamed), sampled_together(name))
@@ -153,7 +154,7 @@ def test_streams_the_same_scans_without_end(name):
 
 def test_seeds_and_settings_that_cannot_be_are_refused(name):
     generator, sampling = made(name)
-    if generator.needs_condition:
+    if Nothing not in generator.takes:
         return
     for seeds, message in (
         ([], "no seeds"),
@@ -163,21 +164,21 @@ def test_seeds_and_settings_that_cannot_be_are_refused(name):
         ([10**99], "the seed 1000"),
     ):
         with pytest.raises(ConfigError, match=f"^got {message}.*"):
-            generator.sample(seeds, sampling)
-    assert generator.sample([(1 << 32) - 1], sampling).range_m.shape == (1, 64, 32)
+            generator.sample(seeds, sampling=sampling)
+    assert generator.sample([(1 << 32) - 1], sampling=sampling).range_m.shape == (1, 64, 32)
     with pytest.raises(ConfigError, match=r"^got settings of type SensorModel; wanted \w+; "):
-        generator.sample([0], SENSOR)
+        generator.sample([0], sampling=SENSOR)
 
 
 @pytest.mark.usefixtures("untyped")
 def test_seeds_without_an_order_are_refused(name):
     generator, sampling = made(name)
-    if generator.needs_condition:
+    if Nothing not in generator.takes:
         return
     for seeds, kind in (({3, 4}, "set"), ({3: 4}.keys(), "dict_keys"), (3, "int"), (iter([3]), "list_iterator")):
         with pytest.raises(ConfigError, match=rf"^got seeds of type {kind}; wanted a sequence, such as \[0\]; "):
-            generator.sample(seeds, sampling)
-    assert same(generator.sample(np.array([3]), sampling), sampled_together(name)[:1])
+            generator.sample(seeds, sampling=sampling)
+    assert same(generator.sample(np.array([3]), sampling=sampling), sampled_together(name)[:1])
 
 
 @pytest.mark.usefixtures("untyped")
@@ -207,7 +208,7 @@ def test_images_and_masks_of_others_are_refused(name):
     other = RangeImage(images.range_m, images.return_mask, load_sensor("hdl64e_kitti_360").with_columns(32))
     for capability in sorted(generator.capabilities - {"tokens"}):
         with pytest.raises(ConfigError, match=r"^got range images of the sensor 'hdl64e_kitti_360', 64x32; wanted "):
-            call(generator, calls(other, Condition.of_pixels(other, observed), seeds, sampling)[capability])
+            call(generator, calls(other, Observed.of_pixels(other, observed), seeds, sampling)[capability])
         if capability != "complete":
             with pytest.raises(ConfigError, match=r"^got range images of shape \(64, 32\); wanted a batch"):
                 call(generator, calls(images[0], None, seeds, sampling)[capability])
@@ -218,7 +219,7 @@ def test_images_and_masks_of_others_are_refused(name):
                 call(generator, calls(images, condition, [0, -2], sampling)[capability])
         if capability == "complete" and "surfaces" not in generator.conditions:
             with pytest.raises(ConfigError, match=r"^got ranges of surfaces .*; wanted pixels of which range and "):
-                generator.complete(Condition.of_surfaces(images), seeds, sampling)
+                generator.complete(Observed.of_surfaces(images), seeds, sampling)
 
 
 def test_scans_are_those_of_its_sensor(name):
@@ -255,6 +256,7 @@ def test_leaves_the_global_random_state_alone(name):
 def test_has_exactly_the_capabilities_that_it_declares(name):
     generator, _ = made(name)
     assert HOOKS.keys() == CAPABILITIES.keys()
+    assert (Observed in generator.takes) == ("complete" in generator.capabilities)
     for capability, hook in HOOKS.items():
         assert (getattr(type(generator), hook) is not getattr(Generator, hook)) == (
             capability in generator.capabilities
@@ -275,7 +277,7 @@ def test_settings_that_only_completion_reads_are_no_settings_of_sampling(name):
 def test_what_it_cannot_do_is_told_with_who_can(name):
     generator, sampling = made(name)
     images = IMAGES.batch([0, 1])
-    condition = Condition.of_pixels(images, images.return_mask)
+    condition = Observed.of_pixels(images, images.return_mask)
     for capability, arguments in calls(images, condition, [0, 1], sampling).items():
         if capability in generator.capabilities:
             continue
@@ -289,9 +291,9 @@ def test_what_it_cannot_do_is_told_with_who_can(name):
 
 def test_scans_of_which_nothing_is_known_are_generated(name):
     generator, sampling = made(name)
-    if "complete" not in generator.capabilities or generator.needs_condition:
+    if "complete" not in generator.capabilities or Nothing not in generator.takes:
         return
-    generated = generator.complete(Condition.nothing(SENSOR, 2), [0, 1], sampling)
+    generated = generator.complete(Observed.nothing(SENSOR, 2), [0, 1], sampling)
     assert generated.range_m.shape == (2, 64, 32)
     assert generated.return_mask.any()
 
@@ -335,7 +337,7 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
         objective = generator.objective(stage).train()
         for player in objective.players or ("",):
             rng = torch.Generator().manual_seed(0)
-            objective(IMAGES.batch([0, 1]), rng, player)["loss"].backward()
+            objective(Example(IMAGES.batch([0, 1])), rng, player)["loss"].backward()
         gradients = [weight.grad for weight in objective.parameters() if weight.grad is not None]
         assert gradients
         assert all(bool(gradient.isfinite().all()) for gradient in gradients)

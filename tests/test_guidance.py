@@ -34,10 +34,12 @@ def guided(plain):
 
 
 def test_the_model_s_own_is_taken_unless_another_is_named(plain, guided):
-    own, wanted = guided.sample([0, 1]).range_m, plain.sample([0, 1], TokenSampling(guidance=3.0)).range_m
+    own, wanted = guided.sample([0, 1]).range_m, plain.sample([0, 1], sampling=TokenSampling(guidance=3.0)).range_m
     assert torch.equal(own, wanted)
     assert not torch.equal(plain.sample([0, 1]).range_m, wanted)
-    assert torch.equal(guided.sample([0, 1], TokenSampling(guidance=1.0)).range_m, plain.sample([0, 1]).range_m)
+    assert torch.equal(
+        guided.sample([0, 1], sampling=TokenSampling(guidance=1.0)).range_m, plain.sample([0, 1]).range_m
+    )
     assert guided.cost() == plain.cost(TokenSampling(guidance=3.0))
     assert guided.cost().flops > plain.cost().flops
 

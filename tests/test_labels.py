@@ -16,7 +16,8 @@ from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.generation.generator import load
 from lidargrit.scans.classes import LEARNED
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.fills import fill, fill_lacking
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import load_sensor
@@ -102,7 +103,7 @@ def test_hints_tell_the_class_of_the_next_return_on_every_side():
     label = torch.zeros(1, 64, 32, dtype=torch.int64)
     label[0, 10, 4], label[0, 10, 30], label[0, 20, 6] = 40, 50, 70
     image = RangeImage(range_m, range_m > 0, SENSOR, label=label)
-    found = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
+    found = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.labels is not None
     assert found.labels[0, :, 10, 6].tolist() == [70, 70, 70, 40, 50]  # nothing above: as the nearest, that below
     mirrored = found.mirrored().labels
@@ -117,7 +118,7 @@ def test_it_learns_classes_and_begins_with_those_of_neighbours():
     assert 0.4 < accuracies[0] < 0.95
     assert accuracies[-1] > accuracies[0]
     with pytest.raises(ConfigError, match="training scans without labels"):
-        objective(replace(images, label=None), torch.Generator())
+        objective(Example(replace(images, label=None)), torch.Generator())
 
 
 def test_without_labels_in_the_model_nothing_grows_and_with_them_it_begins_the_same():
@@ -173,7 +174,7 @@ def test_a_scan_without_labels_gets_none(folders):
 
 def test_raydrop_sees_classes_and_keeps_those_of_what_returns(folders, tmp_path):
     model, images = load(folders / "run"), streets(1)
-    dropped = model.complete(Condition.of_surfaces(images), [0])
+    dropped = model.complete(Observed.of_surfaces(images), [0])
     assert dropped.label is not None
     assert images.label is not None
     assert torch.equal(dropped.label[dropped.return_mask], images.label[dropped.return_mask])
@@ -197,7 +198,7 @@ def test_raydrop_learns_what_a_class_does():
         optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
         for step in range(8):
             shuffled = marked.mapped(lambda pixels, by=step: pixels.roll(8 * by, -2))  # rows tell nothing
-            loss = objective(shuffled, torch.Generator().manual_seed(step))["loss"]
+            loss = objective(Example(shuffled), torch.Generator().manual_seed(step))["loss"]
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

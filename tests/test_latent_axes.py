@@ -8,6 +8,7 @@ import torch
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.scans.example import Example
 from lidargrit.systems.lidm.latent_axes import LatentAxes
 from lidargrit.systems.lidm.system import Lidm, LidmConfig
 from test_lidm import SENSOR, SMALL, made, walls
@@ -44,7 +45,7 @@ def test_scans_are_sampled_by_the_axes_of_the_codes():
     assert generator.latent_shape[0] == 2
     objective = generator.objective("denoiser")
     with torch.no_grad():
-        terms = objective(images, torch.Generator().manual_seed(0))
+        terms = objective(Example(images), torch.Generator().manual_seed(0))
     assert bool(terms["loss"].isfinite())
     assert float(generator.axes.scale.std()) == 0, "asking for an objective changes nothing"
     generator.load_stage("denoiser", objective)

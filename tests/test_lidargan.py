@@ -11,7 +11,8 @@ from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.generation.presets import load_preset
 from lidargrit.nn.flops import flops_of
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
@@ -257,7 +258,7 @@ def test_each_player_moves_its_own_weights():
     parts = {"discriminator": objective.discriminator, "generator": objective.decoder}
     for player, own in parts.items():
         objective.zero_grad()
-        terms = objective(batch, torch.Generator().manual_seed(0), player)
+        terms = objective(Example(batch), torch.Generator().manual_seed(0), player)
         terms["loss"].backward()
         for part in parts.values():
             assert all((weight.grad is not None) == (part is own) for weight in part.parameters())
@@ -270,7 +271,7 @@ def test_a_scan_is_learned_by_heart_and_given_back():
     objective, losses = generator.objective("autoencoder").train(), []
     optimiser = torch.optim.Adam(objective.parameters(), lr=1e-2)
     for step in range(60):
-        terms = objective(images, torch.Generator().manual_seed(step))
+        terms = objective(Example(images), torch.Generator().manual_seed(step))
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()
@@ -288,7 +289,7 @@ def test_the_weight_of_the_divergence_rises_over_the_first_scans():
     generator = LidarVae(LidarVaeConfig(**SMALLEST, warmup_scans=16, free_nats=50.0), SENSOR)
     objective, batch, found = generator.objective("autoencoder").train(), walls(), []
     for step in range(6):
-        terms = objective(batch, torch.Generator().manual_seed(step))
+        terms = objective(Example(batch), torch.Generator().manual_seed(step))
         found.append(float(terms["loss"].detach() - terms["absolute_error"]) / 50)
     assert found == pytest.approx([0.25, 0.5, 0.75, 1, 1, 1], rel=1e-3)
     assert float(terms["kl_nats"]) < 50  # so all of it is free
@@ -299,19 +300,19 @@ def test_a_scan_is_completed_from_its_observed_pixels_alone():
     generator.fit_statistics(images_of(images))
     observed = torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
-    done = generator.complete(Condition.of_pixels(images, observed), [0, 1])
+    done = generator.complete(Observed.of_pixels(images, observed), [0, 1])
     assert torch.equal(done.range_m[observed], images.range_m[observed])
     hidden = RangeImage.masked(
         torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.reflectance
     )
-    assert torch.equal(generator.complete(Condition.of_pixels(hidden, observed), [0, 1]).range_m, done.range_m)
-    assert not torch.equal(generator.complete(Condition.of_pixels(images, observed), [2, 3]).range_m, done.range_m)
+    assert torch.equal(generator.complete(Observed.of_pixels(hidden, observed), [0, 1]).range_m, done.range_m)
+    assert not torch.equal(generator.complete(Observed.of_pixels(images, observed), [2, 3]).range_m, done.range_m)
     mean = VaeSampling(spread=0.0)
     assert torch.equal(
-        generator.complete(Condition.of_pixels(images, observed), [0, 1], mean).range_m,
-        generator.complete(Condition.of_pixels(images, observed), [2, 3], mean).range_m,
+        generator.complete(Observed.of_pixels(images, observed), [0, 1], mean).range_m,
+        generator.complete(Observed.of_pixels(images, observed), [2, 3], mean).range_m,
     )
-    nothing = generator.complete(Condition.nothing(SENSOR, 2), [0, 1])
+    nothing = generator.complete(Observed.nothing(SENSOR, 2), [0, 1])
     assert bool(nothing.return_mask[:, 40:].all())
 
 

@@ -1,7 +1,6 @@
 """LiDARGen: its network, loss and sampler against the program's numbers, its checkpoints, raydrop, completion."""
 
 import json
-import math
 from dataclasses import replace
 
 import pytest
@@ -11,7 +10,8 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.generation.presets import load_preset
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
@@ -100,8 +100,7 @@ def test_noise_levels_and_the_norm_are_the_programs(numbers):
     agree(sigma_table(50.0, 0.01, 232), numbers["sigmas_232"], 1e-6)
     agree(sigma_table(50.0, 0.01, 232) / torch.from_numpy(numbers["sigmas_232"]), torch.ones(232), 1e-6)
     agree(sigma_table(8.0, 0.05, 20), numbers["sigmas_20"], 1e-6)
-    norm = InstanceNormPlus(6)
-    norm.load_state_dict(seeded(numbers, "norm"))
+    (norm := InstanceNormPlus(6)).load_state_dict(seeded(numbers, "norm"))
     agree(norm(torch.from_numpy(numbers["norm_x"])).detach(), numbers["norm_y"])
 
 
@@ -201,11 +200,11 @@ def test_levels_steps_and_their_size_are_choices_and_are_counted():
     passes = []
     hook = generator.network.register_forward_hook(lambda *_: passes.append(1))
     settings = LangevinSampling(levels=3, steps_each=2, step_lr=1e-9)
-    first = generator.sample([0], settings)
+    first = generator.sample([0], sampling=settings)
     assert len(passes) == 7
     hook.remove()
     for other in ({"levels": 4}, {"steps_each": 3}, {"step_lr": 2e-9}):
-        assert not torch.equal(generator.sample([0], replace(settings, **other)).range_m, first.range_m)
+        assert not torch.equal(generator.sample([0], sampling=replace(settings, **other)).range_m, first.range_m)
     one, two = (generator.cost(LangevinSampling(levels=levels, steps_each=1)).flops for levels in (2, 5))
     assert one == two / 2 > 0
 
@@ -248,7 +247,7 @@ def test_the_cost_of_a_pass_at_the_small_size_is_that_counted_in_the_program():
     [
         {"channels": 1},
         {"log2_scale": 0.0},
-        {"log2_scale": math.nan},
+        {"log2_scale": float("nan")},
         {"sigma_largest": 0.001},
         {"sigma_smallest": 0.0},
         {"levels": 1},
@@ -276,9 +275,10 @@ def test_images_that_cannot_be_halved_are_refused():
 def test_scans_without_reflectance_train_the_range_only():
     images = walls(reflectance=False)
     with pytest.raises(ConfigError, match=r"without reflectance.*model\.reflectance=false"):
-        made().objective("score")(images, torch.Generator().manual_seed(0))
+        made().objective("score")(Example(images), torch.Generator().manual_seed(0))
     generator = made(reflectance=False)
-    assert bool(generator.objective("score")(images, torch.Generator().manual_seed(0))["loss"].isfinite())
+    loss = generator.objective("score")(Example(images), torch.Generator().manual_seed(0))["loss"]
+    assert bool(loss.isfinite())
     assert generator.sample([0]).reflectance is None
 
 
@@ -286,20 +286,20 @@ def test_a_completed_scan_keeps_what_was_observed_whichever_pixels_these_are():
     generator, images = made(), walls()
     sampling = LangevinSampling(levels=3, steps_each=2, step_lr=1e-9)
     observed = torch.rand(2, 64, 32, generator=torch.Generator().manual_seed(4)) < 0.3
-    done = generator.complete(Condition.of_pixels(images, observed), [0, 1], sampling)
+    done = generator.complete(Observed.of_pixels(images, observed), [0, 1], sampling)
     for name in ("range_m", "return_mask", "reflectance"):
         assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
     hidden = RangeImage.masked(
         torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.reflectance
     )
-    again = generator.complete(Condition.of_pixels(hidden, observed), [0, 1], sampling)
+    again = generator.complete(Observed.of_pixels(hidden, observed), [0, 1], sampling)
     assert torch.equal(again.range_m, done.range_m)
     # What the network sees of the observed pixels reaches the others.
     nothing = torch.zeros_like(observed)
-    free = generator.complete(Condition.of_pixels(images, nothing), [0, 1], sampling)
-    assert torch.equal(free.range_m, generator.sample([0, 1], sampling).range_m)
+    free = generator.complete(Observed.of_pixels(images, nothing), [0, 1], sampling)
+    assert torch.equal(free.range_m, generator.sample([0, 1], sampling=sampling).range_m)
     assert not torch.equal(done.range_m[~observed], free.range_m[~observed])
-    weaker = generator.complete(Condition.of_pixels(images, observed), [0, 1], replace(sampling, pull=0.1))
+    weaker = generator.complete(Observed.of_pixels(images, observed), [0, 1], replace(sampling, pull=0.1))
     assert not torch.equal(weaker.range_m[~observed], done.range_m[~observed])
 
 
@@ -314,7 +314,7 @@ def test_an_image_is_learned_by_heart():
     objective, losses = generator.objective("score").train(), []
     optimiser = torch.optim.Adam(objective.parameters(), lr=4e-3)
     for step in range(40):
-        terms = objective(images, torch.Generator().manual_seed(step))
+        terms = objective(Example(images), torch.Generator().manual_seed(step))
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()

@@ -22,6 +22,7 @@ from lidargrit.generation.tokenizers.curve_vqvae import (
     return_threshold,
 )
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, TokenGrid
 from lidargrit.systems.lidargrit.system import LidarGrit
@@ -186,13 +187,13 @@ def test_the_loss_is_the_programs_once_its_discriminator_is_off(numbers):
     assert float(error) + 0.37 == pytest.approx(float(numbers["loss_step2"][0]), rel=1e-6)
     assert float(numbers["loss_step2"][2]) == 0, "the weight of the discriminator"
     with torch.no_grad():
-        terms = made().tokenizer(walls(), torch.Generator().manual_seed(0))
+        terms = made().tokenizer(Example(walls()), torch.Generator().manual_seed(0))
     assert float(terms["loss"]) == pytest.approx(float(terms["reconstruction"] + terms["commitment"]))
 
 
 def test_a_mask_channel_is_learned_beside_the_range():
     tokenizer = CurveVqvae(CurveVqvaeConfig(32, (1, 1), (2,), 1, 4, 32, mask_head=True), SENSOR)
-    terms = tokenizer(walls(), torch.Generator().manual_seed(0))
+    terms = tokenizer(Example(walls()), torch.Generator().manual_seed(0))
     loss = (terms["reconstruction"] + terms["raydrop"]) / 2 + terms["commitment"]
     assert float(terms["loss"].detach()) == pytest.approx(float(loss.detach()))
 
@@ -277,7 +278,7 @@ def test_shared_latents_are_scaled_and_come_back_as_tokens():
     spread = float(generator.tokenizer.quantize.embedding.weight.detach().std(correction=0))
     assert float(objective.latent_scale) == pytest.approx(spread, rel=1e-5)
     with torch.no_grad():
-        terms = objective(images, torch.Generator().manual_seed(0))
+        terms = objective(Example(images), torch.Generator().manual_seed(0))
     latents = generator.tokenizer.latents(images)
     assert float(terms["latent_std"]) == pytest.approx(float(latents.std().detach()) / spread, rel=1e-4)
     fresh = made(config)
@@ -312,7 +313,7 @@ def test_noise_in_latents_is_learned():
     objective, images, losses = made().objective("denoiser").train(), walls(), []
     optimiser = torch.optim.Adam(objective.parameters(), lr=5e-3)
     for step in range(12):
-        terms = objective(images, torch.Generator().manual_seed(step))
+        terms = objective(Example(images), torch.Generator().manual_seed(step))
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()

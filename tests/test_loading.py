@@ -350,7 +350,7 @@ def test_batches_come_in_one_order_whatever_reads_them(tree):
 
     def stream(workers_count, first=0, **process):
         batches = Batches(images, 4, ("flip", "roll"), True, 3, workers=workers_count, **process)
-        return [batch.range_m for batch in batches.stream(first, 24)]
+        return [batch.images.range_m for batch in batches.stream(first, 24)]
 
     alone = stream(1)
     assert len(alone) == 6
@@ -358,10 +358,10 @@ def test_batches_come_in_one_order_whatever_reads_them(tree):
     assert all(torch.equal(one, other) for one, other in zip(alone[2:], stream(3, first=8), strict=True))
     shares = zip(stream(2, rank=0, world_size=2), stream(1, rank=1, world_size=2), strict=True)
     ordered = Batches(images, 4, (), False, 3)
-    whole = [ordered.at(seen).range_m for seen in range(0, 24, 4)]
+    whole = [ordered.at(seen).images.range_m for seen in range(0, 24, 4)]
     plain = [Batches(images, 4, (), False, 3, rank, 2) for rank in (0, 1)]
     for seen, both in zip(range(0, 24, 4), whole, strict=True):
-        assert torch.equal(torch.cat([batches.at(seen).range_m for batches in plain]), both)
+        assert torch.equal(torch.cat([batches.at(seen).images.range_m for batches in plain]), both)
     assert all(len(one) == len(other) == 2 for one, other in shares)
 
 

@@ -13,6 +13,7 @@ from lidargrit.core.configuration import override
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.presets import load_preset
 from lidargrit.nn.transformer import CausalTransformer, MaskedTransformer, TransformerConfig
+from lidargrit.scans.example import Example
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.maskgit.system import (
     HiddenTokens,
@@ -142,7 +143,7 @@ def test_the_objective_asks_for_hidden_tokens_only():
     seen = []
     generator.transformer.register_forward_hook(lambda module, given, found: seen.append((given[0], found)))
     with torch.no_grad():
-        terms = objective(images, torch.Generator().manual_seed(1))
+        terms = objective(Example(images), torch.Generator().manual_seed(1))
     given_tokens, logits = seen[0]
     hidden = given_tokens == generator.transformer.mask_token
     assert torch.equal(given_tokens[~hidden], tokens[~hidden])
@@ -160,7 +161,7 @@ def test_the_cost_is_what_torch_counts():
 
     generator, sampling = small_maskgit(), MaskedSampling(steps=3)
     with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):  # the CPU's own is not counted
-        generator.sample([0], sampling)
+        generator.sample([0], sampling=sampling)
     assert generator.cost(sampling).flops == counter.get_total_flops()
     assert generator.cost(sampling).network_evaluations == 3 + 1
 

@@ -14,6 +14,7 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
@@ -55,7 +56,7 @@ class Wrapped(Objective):
         super().__init__(load_sensor("hdl64e_kitti_odometry"))
         self.network = network
 
-    def forward(self, images, rng, player):
+    def forward(self, example, rng, player):
         raise NotImplementedError
 
 
@@ -124,7 +125,7 @@ def test_the_loss_is_the_papers_sum(images, weight):
     torch.manual_seed(0)
     vqvae = Vqvae(model, images.sensor).eval()
     with torch.no_grad():
-        terms = vqvae(images, torch.Generator())
+        terms = vqvae(Example(images), torch.Generator())
         tokens = vqvae.encode(images)
         logits = vqvae.decode(tokens).return_logits
     log_likelihood = torch.where(images.return_mask, logits.sigmoid().log(), (1 - logits.sigmoid()).log())
@@ -139,17 +140,17 @@ def test_gradients_are_clipped_and_infinite_ones_change_nothing(images):
             super().__init__(images.sensor)
             self.weight, self.slope = nn.Parameter(torch.zeros(2)), 1e6
 
-        def forward(self, images, rng, player):
+        def forward(self, example, rng, player):
             return {"loss": (self.weight * self.slope).sum()}
 
     steep = Steep()
     engine, optimiser = Engine("fp32"), torch.optim.SGD(steep.parameters(), lr=1.0)
     engine.set_up(steep, optimiser)
-    engine.step(images, 0, gradient_clip=0.5)
+    engine.step(Example(images), 0, gradient_clip=0.5)
     assert float(steep.weight.detach().norm()) == pytest.approx(0.5, rel=1e-4)
     before, steep.slope = steep.weight.detach().clone(), math.inf
     steep.weight.data.fill_(0.0)
-    assert not bool(engine.step(images, 0, gradient_clip=0.5)["loss"].isfinite())
+    assert not bool(engine.step(Example(images), 0, gradient_clip=0.5)["loss"].isfinite())
     assert steep.weight.tolist() == [0.0, 0.0]
     assert before.numel() == 2
 
@@ -160,13 +161,13 @@ def test_a_gradient_that_is_no_number_moves_nothing_without_a_limit_either(image
             super().__init__(images.sensor)
             self.weight = nn.Parameter(torch.zeros(2))
 
-        def forward(self, images, rng, player):
+        def forward(self, example, rng, player):
             return {"loss": self.weight.sqrt().sum()}  # 0, with a slope of infinity
 
     cornered = Cornered()
     engine = Engine("fp32")
     engine.set_up(cornered, torch.optim.SGD(cornered.parameters(), lr=1.0))
-    assert not bool(engine.step(images, 0, gradient_clip=0.0)["loss"].isfinite())
+    assert not bool(engine.step(Example(images), 0, gradient_clip=0.0)["loss"].isfinite())
     assert cornered.weight.tolist() == [0.0, 0.0]
 
 
@@ -176,14 +177,14 @@ def test_ranges_reach_the_objective_unrounded(images):
             super().__init__(images.sensor)
             self.weight, self.heard = nn.Parameter(torch.zeros(1)), None
 
-        def forward(self, images, rng, player):
-            self.heard = images.range_m
+        def forward(self, example, rng, player):
+            self.heard = example.images.range_m
             return {"loss": self.weight.sum()}
 
     listening = Listening()
     engine = Engine("bf16")
     engine.set_up(listening, torch.optim.SGD(listening.parameters(), lr=1.0))
-    engine.step(images, 0, gradient_clip=0.5)
+    engine.step(Example(images), 0, gradient_clip=0.5)
     assert torch.equal(listening.heard, images.range_m)
 
 

@@ -21,7 +21,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     phases_of,
 )
 from lidargrit.nn.precision import Precision
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Decoded, RangeImage
 from mixture_loops import density_of_v
@@ -105,7 +105,7 @@ def test_sampled_masks_come_as_often_as_their_probability() -> None:
     probability = decoder(repeated(decoded, len(masks)), images).mask.sum((1, 2)).neg().exp()
     count = 20_000
     uniform = torch.rand(count, 2, 4, generator=torch.Generator().manual_seed(0))
-    nothing = Condition.nothing(sensor, count)
+    nothing = Observed.nothing(sensor, count)
     sampled = decoder.mask.sample(Guide.of(repeated(decoded, count)), uniform, nothing)  # all in one batch
     index = (sampled.flatten(1) * 2 ** torch.arange(7, -1, -1)).sum(1)
     seen = torch.bincount(index, minlength=len(masks)) / count
@@ -248,7 +248,7 @@ def test_observed_pixels_come_back_as_they_are_and_move_their_neighbours() -> No
 
     def sample(known: Tensor) -> RangeImage:
         rngs = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
-        return decoder.sample(decoded, rngs, PixelSampling(), Condition.of_pixels(images, known))
+        return decoder.sample(decoded, rngs, PixelSampling(), Observed.of_pixels(images, known))
 
     free, completed = sample(torch.zeros_like(observed)), sample(observed)
     assert torch.equal(completed.range_m[observed], images.range_m[observed])

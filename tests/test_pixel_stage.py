@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import pickle
@@ -26,7 +27,7 @@ from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit import system as lidargrit
@@ -85,8 +86,8 @@ def test_the_third_stage_is_there_where_the_configuration_has_one():
 def test_the_pixel_decoder_is_what_samples_unless_told_otherwise():
     generator, plain = made(), made(None)
     by_pixels = generator.sample([0, 1])
-    assert torch.equal(by_pixels.range_m, generator.sample([0, 1], TokenSampling(mask="pixels")).range_m)
-    before = generator.sample([0, 1], TokenSampling(mask="bernoulli"))
+    assert torch.equal(by_pixels.range_m, generator.sample([0, 1], sampling=TokenSampling(mask="pixels")).range_m)
+    before = generator.sample([0, 1], sampling=TokenSampling(mask="bernoulli"))
     assert torch.equal(before.range_m, plain.sample([0, 1]).range_m)
     assert not torch.equal(by_pixels.return_mask, before.return_mask)
     both = by_pixels.return_mask & before.return_mask
@@ -110,9 +111,21 @@ def test_what_was_prepared_for_sampling_is_kept_for_other_choices_of_pixels(monk
     generator = made()
     generator.sample([0])
     monkeypatch.setattr(lidargrit, "CachedDecoder", None)
-    generator.sample([0], TokenSampling(range_noise=0.5, mask_correlation=0.0))
+    generator.sample([0], sampling=TokenSampling(range_noise=0.5, mask_correlation=0.0))
     with pytest.raises(TypeError):
-        generator.sample([0], TokenSampling(temperature=0.5))
+        generator.sample([0], sampling=TokenSampling(temperature=0.5))
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_after_any_change_of_weights_it_samples_as_a_fresh_one_does(precision):
+    generator, sampling = made(), TokenSampling(weights=precision, decoder=precision)
+    generator.sample([0], sampling=sampling)
+    with torch.no_grad():
+        for weight in generator.parameters():
+            weight.data.mul_(-3)  # which changes neither the address nor the version
+    fresh = copy.deepcopy(generator)
+    fresh._prepared = None
+    assert torch.equal(generator.sample([0], sampling=sampling).range_m, fresh.sample([0], sampling=sampling).range_m)
 
 
 @pytest.mark.parametrize("kind", [LidarGrit, MaskGit])
@@ -120,12 +133,12 @@ def test_a_choice_that_cannot_be_is_refused_before_any_token(kind, monkeypatch):
     generator = kind(kind.Config(TOKENIZER, TRANSFORMER), SENSOR).eval()
     monkeypatch.setattr(generator, "transformer", None)
     with pytest.raises(ConfigError, match="without a pixel decoder"):
-        generator.sample([0], generator.Sampling(mask="pixels"))
+        generator.sample([0], sampling=generator.Sampling(mask="pixels"))
 
 
 def test_a_model_without_a_pixel_decoder_refuses_to_sample_by_one():
     with pytest.raises(ConfigError, match="without a pixel decoder"):
-        made(None).sample([0], TokenSampling(mask="pixels"))
+        made(None).sample([0], sampling=TokenSampling(mask="pixels"))
     with pytest.raises(ConfigError, match="range_noise=0"):
         TokenSampling(range_noise=0.0)
 
@@ -138,11 +151,11 @@ def test_settings_of_a_pixel_decoder_that_samples_nothing_are_refused(kind):
         with pytest.raises(
             ConfigError, match=rf"^got {name}={value}, .* for a model without one; wanted settings that"
         ):
-            without.sample([0], kind.Sampling(**changed))
+            without.sample([0], sampling=kind.Sampling(**changed))
     without.check_choice("auto", kind.Sampling(decoder="bf16").pixels())
     for mask in ("bernoulli", "threshold"):
         with pytest.raises(ConfigError, match=rf"for mask={mask}; wanted .*; leave it out, or take mask=pixels"):
-            made().sample([0], TokenSampling(mask=mask, range_noise=0.5))
+            made().sample([0], sampling=TokenSampling(mask=mask, range_noise=0.5))
 
 
 def test_a_noise_beyond_all_numbers_is_refused():
@@ -154,8 +167,8 @@ def test_maskgit_takes_a_pixel_decoder_too():
     torch.manual_seed(0)
     generator = MaskGit(MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS), SENSOR).eval()
     assert generator.stages == ("tokenizer", "transformer", "pixels")
-    by_pixels = generator.sample([3, 4], MaskedSampling(steps=2))
-    assert torch.equal(by_pixels.range_m[1], generator.sample([4], MaskedSampling(steps=2)).range_m[0])
+    by_pixels = generator.sample([3, 4], sampling=MaskedSampling(steps=2))
+    assert torch.equal(by_pixels.range_m[1], generator.sample([4], sampling=MaskedSampling(steps=2)).range_m[0])
     assert generator.cost().flops > generator.cost(MaskedSampling(mask="bernoulli")).flops
 
 
@@ -211,7 +224,7 @@ def test_a_scan_is_completed_from_the_tokens_and_pixels_that_were_observed():
     generator, images = made(), scans(2)
     observed = torch.zeros_like(images.return_mask)
     observed[:, :, :24] = True  # three columns of tokens
-    known = Condition.of_pixels(images, observed)
+    known = Observed.of_pixels(images, observed)
     tokens = generator.observed_tokens(known).view(2, 8, 8)
     assert bool((tokens[:, :, :3] >= 0).all())
     assert bool((tokens[:, :, 3:] == -1).all())
@@ -220,14 +233,14 @@ def test_a_scan_is_completed_from_the_tokens_and_pixels_that_were_observed():
     assert torch.equal(completed.return_mask[observed], images.return_mask[observed])
     assert not torch.equal(completed.range_m, generator.complete(known, [7, 8]).range_m)
     assert torch.equal(completed.range_m[1], generator.complete(known[1:], [6]).range_m[0])
-    whole = Condition.of_pixels(images, torch.ones_like(observed))
+    whole = Observed.of_pixels(images, torch.ones_like(observed))
     assert torch.equal(generator.observed_tokens(whole), generator.tokenizer.encode(images).tokens.flatten(1))
     assert torch.equal(generator.complete(whole, [5, 6]).range_m, images.range_m)
 
 
 def test_returns_are_sampled_where_only_the_ranges_of_surfaces_are_known():
     generator, images = made(), scans(2)
-    clean = Condition.of_surfaces(images)
+    clean = Observed.of_surfaces(images)
     assert generator.conditions == {"pixels", "surfaces"}
     dropped = generator.complete(clean, [5, 6])
     assert not bool((dropped.return_mask & ~images.return_mask).any())
@@ -241,7 +254,7 @@ def test_two_images_of_one_seed_are_completed_each_by_itself():
     generator, images = made(), scans(2)
     observed = torch.zeros_like(images.return_mask)
     observed[:, ::4] = True
-    known = Condition.of_pixels(images, observed)
+    known = Observed.of_pixels(images, observed)
     completed = generator.complete(known, [5, 5])
     assert torch.equal(completed.range_m[observed], images.range_m[observed])
     assert torch.equal(completed.range_m[1], generator.complete(known[1:], [5]).range_m[0])

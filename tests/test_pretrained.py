@@ -18,7 +18,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.presets import load_preset
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.serve import finished_runs
@@ -87,7 +87,7 @@ def test_what_it_completes_is_completed_by_its_runs(model):
     one = RangeImage.stack([project(simulate(seed=2_000_000), model.sensor)])
     observed = torch.zeros_like(one.return_mask)
     observed[:, ::4] = True
-    for job, known in (("complete", Condition.of_pixels(one, observed)), ("raydrop", Condition.of_surfaces(one))):
+    for job, known in (("complete", Observed.of_pixels(one, observed)), ("raydrop", Observed.of_surfaces(one))):
         done, by_run = model.complete(known, [0]), load("pretrained", job).complete(known, [0])
         assert torch.equal(done.range_m, by_run.range_m)
 

@@ -24,6 +24,7 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.nn.processes import of_first_process
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.multiscale.system import Multiscale
@@ -81,8 +82,8 @@ class Game(Objective):
         super().__init__(SENSOR)
         self.one, self.other = torch.nn.Linear(8, 1), torch.nn.Linear(8, 1)
 
-    def forward(self, images, rng, player):
-        seen = images.range_m[:, 0, :8] / 10
+    def forward(self, example, rng, player):
+        seen = example.images.range_m[:, 0, :8] / 10
         error = (
             self.one(seen) - self.other(seen).detach()
             if player == "one"
@@ -96,8 +97,8 @@ class Plain(Objective):
         super().__init__(SENSOR)
         self.linear = torch.nn.Linear(8, 1)
 
-    def forward(self, images, rng, player):
-        return {"loss": self.linear(images.range_m[:, 0, :8]).mean()}
+    def forward(self, example, rng, player):
+        return {"loss": self.linear(example.images.range_m[:, 0, :8]).mean()}
 
 
 def some_images(count):
@@ -111,7 +112,7 @@ def play():
     engine.set_up(game, torch.optim.AdamW(game.parameters(), lr=0.1))
     share = 4 // engine.world_size
     for step in range(5):
-        engine.step(some_images(4)[engine.rank * share : (engine.rank + 1) * share], step, gradient_clip=1.0)
+        engine.step(Example(some_images(4))[engine.rank * share : (engine.rank + 1) * share], step, gradient_clip=1.0)
     return game.state_dict(), engine.rank
 
 
@@ -130,7 +131,7 @@ def steps_with_a_bad_process():
     if engine.rank == 1:
         images = replace(images, range_m=images.range_m.clone())
         images.range_m[0, 0, 0] = torch.nan
-    return [bool(engine.step(images, 0, gradient_clip=1.0)["loss"].isfinite()) for _ in range(2)]
+    return [bool(engine.step(Example(images), 0, gradient_clip=1.0)["loss"].isfinite()) for _ in range(2)]
 
 
 def agreements(rank: int) -> list[bool]:
@@ -149,7 +150,7 @@ def learn_pixels():
     before = copy.deepcopy(objective.state_dict())
     engine, _ = begin_training(objective, learn)
     for step in range(4):
-        assert bool(engine.step(some_images(1), step + engine.rank, gradient_clip=0.0)["loss"].isfinite())
+        assert bool(engine.step(Example(some_images(1)), step + engine.rank, gradient_clip=0.0)["loss"].isfinite())
     moved = [name for name, weight in objective.state_dict().items() if not torch.equal(weight, before[name])]
     return len(moved) > len(before) / 2
 
@@ -170,7 +171,7 @@ def loss_of_pixels(rank: int, processes: int) -> torch.Tensor:
     mask = images.return_mask & (torch.arange(SENSOR.width) % 16 == 0)
     mask[:2] = True
     images = RangeImage.masked(images.range_m, mask, SENSOR)[rank * share : (rank + 1) * share]
-    return objective(images, torch.Generator().manual_seed(0), "")["loss"].detach()
+    return objective(Example(images), torch.Generator().manual_seed(0), "")["loss"].detach()
 
 
 def losses(folder: Path, stage: str, name: str) -> list[float]:
@@ -240,7 +241,7 @@ def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
         learn = TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=accumulate, average_over_scans=0)
         optimiser, engine = make_optimiser(vqvae, learn), Engine("fp32")
         engine.set_up(vqvae, optimiser)
-        terms = engine.step(images.batch(range(4)), 0, 0.0, accumulate)
+        terms = engine.step(Example(images.batch(range(4))), 0, 0.0, accumulate)
         moments = [state["exp_avg"] for state in optimiser.state.values()]
         found.append((float(terms["loss"]), torch.cat([moment.flatten() for moment in moments])))
     assert found[1][0] == pytest.approx(found[0][0], rel=1e-5)

@@ -12,7 +12,8 @@ from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.range_values import encode
 from lidargrit.inference.samples import write_samples
 from lidargrit.nn.flops import flops_of
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm, R2dmConfig, load_published
@@ -270,27 +271,28 @@ def test_ranges_are_encoded_as_published_and_come_back():
 def test_calibrated_raydrop_returns_as_many_rays_as_the_training_scans():
     generator = made(reflectance=False, calibration_scans=4)
     with pytest.raises(ConfigError, match=r"raydrop=calibrated.*never fitted"):
-        generator.sample([0], DiffusionSampling(steps=2, raydrop="calibrated"))
+        generator.sample([0], sampling=DiffusionSampling(steps=2, raydrop="calibrated"))
     generator.return_share.fill_(0.7)
     generator.after_training()
     sampling = DiffusionSampling(steps=32, raydrop="calibrated")
-    assert float(generator.sample(range(4), sampling).return_mask.float().mean()) == pytest.approx(0.7, abs=0.03)
+    share = generator.sample(range(4), sampling=sampling).return_mask.float().mean()
+    assert float(share) == pytest.approx(0.7, abs=0.03)
 
 
 def test_scans_without_reflectance_train_the_range_only():
     images = walls(reflectance=False)
     with pytest.raises(ConfigError, match=r"without reflectance.*model\.reflectance=false"):
-        made().objective("diffusion")(images, torch.Generator().manual_seed(0))
+        made().objective("diffusion")(Example(images), torch.Generator().manual_seed(0))
     generator = made(reflectance=False)
-    assert bool(generator.objective("diffusion")(images, torch.Generator().manual_seed(0))["loss"].isfinite())
-    assert generator.sample([0], DiffusionSampling(steps=2)).reflectance is None
+    assert bool(generator.objective("diffusion")(Example(images), torch.Generator().manual_seed(0))["loss"].isfinite())
+    assert generator.sample([0], sampling=DiffusionSampling(steps=2)).reflectance is None
 
 
 def test_a_completed_scan_keeps_what_was_observed():
     generator, images = made(), walls()
     observed = torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
-    done = generator.complete(Condition.of_pixels(images, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
+    done = generator.complete(Observed.of_pixels(images, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
     for name in ("range_m", "return_mask", "reflectance"):
         assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
     assert not torch.equal(done.range_m[~observed], images.range_m[~observed])
@@ -301,21 +303,24 @@ def test_a_completed_scan_keeps_what_was_observed():
         SENSOR,
         torch.where(observed, images.reflectance, 0),
     )
-    again = generator.complete(Condition.of_pixels(hidden, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
+    again = generator.complete(Observed.of_pixels(hidden, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
     assert torch.equal(again.range_m, done.range_m)
     with pytest.raises(ConfigError, match="1 seeds for 2 images"):
-        generator.complete(Condition.of_pixels(images, observed), [0])
+        generator.complete(Observed.of_pixels(images, observed), [0])
     with pytest.raises(ConfigError, match="sampler=ddim for completion"):
-        generator.complete(Condition.of_pixels(images, observed), [0, 1], DiffusionSampling(sampler="ddim"))
+        generator.complete(Observed.of_pixels(images, observed), [0, 1], DiffusionSampling(sampler="ddim"))
     with pytest.raises(ConfigError, match="observed pixels of shape"):
-        generator.complete(Condition.of_pixels(images, observed[:1]), [0, 1])
+        generator.complete(Observed.of_pixels(images, observed[:1]), [0, 1])
 
 
 def test_reflectance_is_saved_with_samples_and_read_back(tmp_path):
     generator = made()
     generator.save(tmp_path / "run")
     write_samples(generator, tmp_path / "run", tmp_path / "out", [0, 1], DiffusionSampling(steps=2))
-    drawn, read = generator.sample([0, 1], DiffusionSampling(steps=2)), read_samples(tmp_path / "out").batch([0, 1])
+    drawn, read = (
+        generator.sample([0, 1], sampling=DiffusionSampling(steps=2)),
+        read_samples(tmp_path / "out").batch([0, 1]),
+    )
     assert torch.allclose(read.range_m, drawn.range_m)
     assert torch.allclose(read.reflectance, drawn.reflectance)
 
@@ -342,13 +347,13 @@ def test_an_image_is_learned_by_heart():
     losses = []
     batch = RangeImage.stack([images[0]] * 2)
     for step in range(100):
-        loss = objective(batch, torch.Generator().manual_seed(step))["loss"]
+        loss = objective(Example(batch), torch.Generator().manual_seed(step))["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         losses.append(float(loss.detach()))
     assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
-    drawn = generator.sample([0], DiffusionSampling(steps=12))
-    unlearned = made(reflectance=False).sample([0], DiffusionSampling(steps=12))
+    drawn = generator.sample([0], sampling=DiffusionSampling(steps=12))
+    unlearned = made(reflectance=False).sample([0], sampling=DiffusionSampling(steps=12))
     error, before = (float((each.range_m - images.range_m).abs().mean()) for each in (drawn, unlearned))
     assert error < 0.8 * before

@@ -11,6 +11,7 @@ from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.range_values import decode, encode
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2flow import flow
@@ -146,7 +147,9 @@ def test_later_trainings_straighten_and_distil_the_flow():
         optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
         found = []
         for step in range(24):
-            loss = objective(images, torch.Generator().manual_seed(step % 2))["loss"]  # the same pairs and times
+            loss = objective(Example(images), torch.Generator().manual_seed(step % 2))[
+                "loss"
+            ]  # the same pairs and times
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -155,7 +158,7 @@ def test_later_trainings_straighten_and_distil_the_flow():
         kept = objective._pairs._kept
         assert set(kept) <= set(range(4)), "a pair is made once, and none is for validation"
         objective.eval()
-        held_out = float(objective(images, torch.Generator().manual_seed(0))["loss"].detach())
+        held_out = float(objective(Example(images), torch.Generator().manual_seed(0))["loss"].detach())
         assert 0 < held_out < 1
         assert max(kept) >= 4
         generator.load_stage(stage, objective)
@@ -182,7 +185,7 @@ def test_a_distilled_model_takes_the_steps_that_it_has_learned():
         (FlowSampling(solver="dopri5"), "solver=dopri5"),
     ):
         with pytest.raises(ConfigError, match=f"got {got} for a model that was distilled to 4 equal steps; wanted "):
-            generator.sample([0], sampling)
+            generator.sample([0], sampling=sampling)
     with pytest.raises(ConfigError, match="got pairs=0, "):
         ReflowConfig(pairs=0)
     with pytest.raises(ConfigError, match="got distilled_steps=-1; wanted 0 to 256"):
@@ -227,7 +230,7 @@ def test_cost_counts_the_passes_of_either_solver():
     passes = []
     generator.network.register_forward_hook(lambda *_: passes.append(1))
     sampling = FlowSampling(solver="dopri5", tolerance=1e-3)
-    generator.sample([0], sampling)
+    generator.sample([0], sampling=sampling)
     assert generator.cost(sampling).network_evaluations * 2 + 1 == len(passes)  # again, and once to count operations
     assert generator.cost().network_evaluations == 256
 
@@ -266,7 +269,7 @@ def test_an_imported_checkpoint_is_a_run_that_samples(tmp_path, capsys):
     assert generator.config == R2flowConfig(PUBLISHED, reflectance=True)
     loaded = generator.network.state_dict()
     assert all(torch.equal(loaded[name], tensor) for name, tensor in checkpoint["weights"].items())
-    assert generator.sample([0], FlowSampling(steps=1)).reflectance.shape == (1, 64, 1024)
+    assert generator.sample([0], sampling=FlowSampling(steps=1)).reflectance.shape == (1, 64, 1024)
 
 
 @pytest.mark.parametrize(
@@ -329,20 +332,20 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_nothing_is_written(tmp_path
 
 def test_an_image_is_learned_by_heart():
     generator, images = made(reflectance=False), walls(1, reflectance=False)
-    before = generator.sample([0], FlowSampling(steps=8))
+    before = generator.sample([0], sampling=FlowSampling(steps=8))
     objective = generator.objective("flow").train()
     optimiser = torch.optim.Adam(objective.parameters(), lr=5e-3)
     losses, batch = [], RangeImage.stack([images[0]] * 4)
     for step in range(80):
-        loss = objective(batch, torch.Generator().manual_seed(step))["loss"]
+        loss = objective(Example(batch), torch.Generator().manual_seed(step))["loss"]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         losses.append(float(loss.detach()))
     assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
     generator.load_stage("flow", objective)
-    found = generator.sample([0], FlowSampling(steps=8))
+    found = generator.sample([0], sampling=FlowSampling(steps=8))
     error, unlearned = (float((each.range_m - images.range_m).abs().mean()) for each in (found, before))
     assert error < 0.7 * unlearned
-    adaptive = generator.sample([0], FlowSampling(solver="dopri5", tolerance=1e-3))
+    adaptive = generator.sample([0], sampling=FlowSampling(solver="dopri5", tolerance=1e-3))
     assert float((adaptive.range_m - images.range_m).abs().mean()) < 0.7 * unlearned

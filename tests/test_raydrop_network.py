@@ -10,7 +10,8 @@ from lidargrit.data.datasets import open_dataset
 from lidargrit.evaluation.realism import simulate_pair
 from lidargrit.generation.generator import load
 from lidargrit.scans import fills
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.fills import ranges_from_others
 from lidargrit.scans.marks import read_marks
 from lidargrit.scans.projection import project
@@ -59,7 +60,7 @@ def test_surfaces_of_a_simulated_scan_mark_what_it_returned():
 
 @torch.no_grad()
 def test_a_scan_depends_on_its_seed_alone_and_only_surfaces_return():
-    network, known = made(), Condition.of_surfaces(pairs(3))
+    network, known = made(), Observed.of_surfaces(pairs(3))
     assert known.has_all_surfaces
     seeds = [torch.Generator().manual_seed(seed) for seed in (5, 6, 5)]
     together = network.sample(known, seeds)
@@ -70,7 +71,7 @@ def test_a_scan_depends_on_its_seed_alone_and_only_surfaces_return():
     assert 0.5 < float(together.return_mask[known.range_observed].float().mean()) < 1
     unknown = torch.zeros_like(known.range_observed)
     unknown[:, 40] = True
-    assert not Condition.of_surfaces(pairs(3), unknown).has_all_surfaces
+    assert not Observed.of_surfaces(pairs(3), unknown).has_all_surfaces
 
 
 def test_it_learns_which_surfaces_return():
@@ -84,8 +85,8 @@ def test_ordinary_scans_are_refused_unless_surfaces_are_estimated():
     images, rng = pairs(2), torch.Generator().manual_seed(0)
     for reflectance in (None, torch.where(images.return_mask, 0.3, 0.0)):
         with pytest.raises(ConfigError, match="scans that do not mark which of their surfaces return"):
-            RaydropObjective(made(), SENSOR)(replace(images, reflectance=reflectance), rng)
-    terms = RaydropObjective(made(replace(TINY, surfaces="estimated")), SENSOR)(images, rng)
+            RaydropObjective(made(), SENSOR)(Example(replace(images, reflectance=reflectance)), rng)
+    terms = RaydropObjective(made(replace(TINY, surfaces="estimated")), SENSOR)(Example(images), rng)
     assert float(terms["loss"]) > 0
 
 
@@ -109,7 +110,7 @@ def test_a_bundle_with_it_drops_by_it(tmp_path):
     torch.manual_seed(0)
     save_bundle(tmp_path, SENSOR, raydrop=TINY)
     bundle, alone, tokens = load(tmp_path), load(tmp_path, "raydrop"), load(tmp_path / "lidargrit")
-    known = Condition.of_surfaces(pairs(2))
+    known = Observed.of_surfaces(pairs(2))
     dropped = bundle.complete(known, [3, 4])
     assert torch.equal(dropped.return_mask, alone.complete(known, [3, 4]).return_mask)
     assert not torch.equal(dropped.return_mask, tokens.complete(known, [3, 4]).return_mask)
@@ -123,11 +124,11 @@ def test_rays_of_which_nothing_is_known_are_none_of_its_business(tmp_path):
     bundle, alone, tokens = load(tmp_path), load(tmp_path, "raydrop"), load(tmp_path / "lidargrit")
     unknown = torch.zeros(3, 64, 32, dtype=torch.bool)
     unknown[1, 20, 5] = True  # so the second one is completed by tokens
-    conditions, seeds = Condition.of_surfaces(pairs(3), unknown), [3, 4, 5]
+    conditions, seeds = Observed.of_surfaces(pairs(3), unknown), [3, 4, 5]
     together, by_tokens = bundle.complete(conditions, seeds), tokens.complete(conditions, seeds)
     pairs_of_masks = zip(together.return_mask, by_tokens.return_mask, strict=True)
     assert [torch.equal(one, other) for one, other in pairs_of_masks] == [False, True, False]
     with pytest.raises(ConfigError, match="scans with rays of which nothing is known"):
         alone.complete(conditions, seeds)
     with pytest.raises(ConfigError, match="wanted ranges of surfaces"):
-        alone.complete(Condition.of_pixels(pairs(1), torch.ones_like(unknown[:1])), [3])
+        alone.complete(Observed.of_pixels(pairs(1), torch.ones_like(unknown[:1])), [3])

@@ -11,7 +11,8 @@ from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling
@@ -46,7 +47,7 @@ def test_it_is_learned(raydrop):
     optimiser = torch.optim.Adam(vqvae.parameters(), lr=3e-3)
     errors = []
     for step in range(12):
-        terms = vqvae(images, torch.Generator().manual_seed(step))
+        terms = vqvae(Example(images), torch.Generator().manual_seed(step))
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()
@@ -60,7 +61,7 @@ def test_it_is_learned(raydrop):
 
 def test_scans_without_it_are_refused():
     vqvae, without = Vqvae(BOTH, SENSOR).eval(), replace(scans(1), reflectance=None)
-    for work in (lambda: vqvae.encode(without), lambda: vqvae(without, torch.Generator())):
+    for work in (lambda: vqvae.encode(without), lambda: vqvae(Example(without), torch.Generator())):
         with pytest.raises(
             ConfigError, match=r"without reflectance, for a model of model\.tokenizer\.reflectance=true"
         ):
@@ -71,14 +72,14 @@ def test_samples_and_completions_have_it():
     torch.manual_seed(0)
     model = LidarGrit(LidarGritConfig(BOTH, TransformerConfig(layers=1, heads=2, width=16), PIXELS), SENSOR).eval()
     for mask in ("pixels", "bernoulli"):
-        image = model.sample([3], TokenSampling(mask=mask))
+        image = model.sample([3], sampling=TokenSampling(mask=mask))
         assert image.reflectance is not None
         assert bool((image.reflectance[image.return_mask] > 0).all())
         assert not bool(image.reflectance[~image.return_mask].any())
     observed = torch.zeros(1, 64, 32, dtype=torch.bool)
     observed[:, :, :16] = True
     scan = scans(1)
-    completed = model.complete(Condition.of_pixels(scan, observed), [5]).reflectance
+    completed = model.complete(Observed.of_pixels(scan, observed), [5]).reflectance
     assert completed is not None
     assert scan.reflectance is not None
     assert torch.equal(completed[observed], scan.reflectance[observed])

@@ -15,7 +15,8 @@ from lidargrit.generation.generator import load
 from lidargrit.generation.objective import hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.settings import Preset
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.fills import FILLS, fill, fill_lacking
 from lidargrit.scans.marks import mark, read_marks
 from lidargrit.scans.projection import unproject
@@ -93,7 +94,7 @@ def test_triangles_interpolate_reflectance_within_surfaces_and_others_take_the_n
     image = RangeImage.stack([RangeImage(torch.full((64, 32), 9.0), torch.ones(64, 32) > 0, SENSOR, bright)])
     observed = torch.zeros(1, 64, 32, dtype=torch.bool)
     observed[:, ::3] = True
-    known = Condition.of_pixels(image, observed)
+    known = Observed.of_pixels(image, observed)
     done = {method: reflectance_of(fill(method, known)) for method in FILLS}
     assert torch.allclose(done["triangulation"][0], bright, atol=1e-4)
     assert torch.equal(done["nearest"], done["linear"])
@@ -103,7 +104,7 @@ def test_triangles_interpolate_reflectance_within_surfaces_and_others_take_the_n
     edge = RangeImage.stack([RangeImage(range_m, range_m > 0, SENSOR, range_m / 50)])
     columns = torch.zeros(1, 64, 32, dtype=torch.bool)
     columns[:, :, ::3] = True
-    filled = reflectance_of(fill("triangulation", Condition.of_pixels(edge, columns)))
+    filled = reflectance_of(fill("triangulation", Observed.of_pixels(edge, columns)))
     assert filled.unique().tolist() == pytest.approx([0.1, 0.8])
 
 
@@ -112,23 +113,23 @@ def test_hints_tell_the_reflectance_of_the_next_return_on_every_side():
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     bright[0, 10, 4], bright[0, 10, 30], bright[0, 20, 6] = 0.2, 0.4, 0.8
     image = RangeImage(range_m, range_m > 0, SENSOR, bright)
-    found = hints_of(Condition.of_pixels(image, torch.ones_like(image.return_mask)))
+    found = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.reflectances is not None
     assert found.reflectances[0, 1:, 10, 6].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.2, 0.4])
     mirrored = found.mirrored().reflectances
     assert mirrored is not None
     assert mirrored[0, 1:, 10, 25].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.4, 0.2])
-    assert hints_of(Condition.nothing(SENSOR, 1)).reflectances is None
+    assert hints_of(Observed.nothing(SENSOR, 1)).reflectances is None
 
 
 @torch.no_grad()
 def test_the_loss_counts_hidden_returns_alone():
     torch.manual_seed(0)
     network, images = CompletionNetwork(NETWORK, SENSOR), streets(2)
-    terms = CompletionObjective(network, SENSOR).eval()(images, torch.Generator().manual_seed(4))
+    terms = CompletionObjective(network, SENSOR).eval()(Example(images), torch.Generator().manual_seed(4))
     rng = torch.Generator().manual_seed(4)
     observed = random_patterns(2, 64, 32, rng)
-    known = Condition.of_pixels(images, observed)
+    known = Observed.of_pixels(images, observed)
     assert known.reflectance is not None
     known = replace(known, reflectance=hidden_in_some(known.reflectance, TYPICAL_REFLECTANCE, 0.25, rng))
     found = network(hints_of(known), observed).reflectance
@@ -160,7 +161,7 @@ def test_it_learns_reflectance_and_begins_near_triangulation():
     errors = [terms["reflectance_error"] for terms in learn(objective, images, [0] * 12, 3e-3)]
     assert errors[-1] < 0.9 * errors[0]
     with pytest.raises(ConfigError, match=r"without reflectance, for a model of model\.completion\.reflectance=true"):
-        objective(replace(images, reflectance=None), torch.Generator())
+        objective(Example(replace(images, reflectance=None)), torch.Generator())
 
 
 @torch.no_grad()
@@ -210,22 +211,22 @@ def test_raydrop_learns_reflectance_from_marks():
     rng = torch.Generator().manual_seed(0)
     with torch.no_grad():
         found = objective.raydrop(images.range_m, images.return_mask).reflectance
-        terms = objective(marked, rng)
+        terms = objective(Example(marked), rng)
     errors = [float((found - images.reflectance)[scan][returned[scan]].abs().mean()) for scan in range(3)]
     assert float(terms["reflectance_error"]) == pytest.approx(sum(errors) / 3, rel=1e-4)
     learned = [terms["reflectance_error"] for terms in learn(objective.train(), marked, range(12), 1e-2)]
     assert learned[-1] < 0.8 * learned[0]
     with pytest.raises(ConfigError, match=r"without their reflectance, for model\.raydrop\.reflectance=true"):
-        objective(replace(images, reflectance=returned.float()), rng)
+        objective(Example(replace(images, reflectance=returned.float())), rng)
     plain = RaydropObjective(RaydropNetwork(replace(RAYDROP, reflectance=False), SENSOR), SENSOR).eval()
     with torch.no_grad():  # files that mark returns alone are the same to a network without reflectance
         by_marks, bare = (
-            plain(replace(images, reflectance=marks), torch.Generator().manual_seed(0))
+            plain(Example(replace(images, reflectance=marks)), torch.Generator().manual_seed(0))
             for marks in (marked.reflectance, returned.float())
         )
     assert by_marks["loss"] == bare["loss"]
     real = RaydropObjective(RaydropNetwork(replace(RAYDROP, surfaces="estimated"), SENSOR), SENSOR).eval()
-    assert float(real(images, rng)["reflectance_error"]) > 0
+    assert float(real(Example(images), rng)["reflectance_error"]) > 0
 
 
 def test_raydrop_writes_the_reflectance_of_the_network_and_not_that_of_the_simulator(folders, tmp_path):
@@ -272,7 +273,7 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
     label = torch.where(scans.return_mask, torch.where(torch.arange(64)[:, None] < 32, 40, 50), 0)
     scans, observed = replace(scans, label=label), torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
-    known = Condition.of_pixels(scans, observed)
+    known = Observed.of_pixels(scans, observed)
     done = model.complete(known, [3, 4], TokenSampling())
     assert done.label is not None
     assert known.label is not None
@@ -291,11 +292,11 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
     assert torch.equal(bare.range_m, done.range_m)
     none = torch.zeros_like(scans.return_mask[1:])
     lost = RangeImage.masked(scans.range_m[1:], none, SENSOR, reflectance_of(scans)[1:], scans.label[1:])
-    mixed = Condition.of_pixels(RangeImage.cat([scans[:1], lost]), observed)
+    mixed = Observed.of_pixels(RangeImage.cat([scans[:1], lost]), observed)
     alone, together = model.complete(mixed[1:2], [4]), model.complete(mixed, [3, 4])
     assert not bool(reflectance_of(alone).any()), "no observed pixel returned"
     assert torch.equal(reflectance_of(together)[1:], reflectance_of(alone)), "whatever else is completed"
-    dark = model.complete(Condition.of_pixels(scans, torch.zeros_like(observed)), [3, 4])
+    dark = model.complete(Observed.of_pixels(scans, torch.zeros_like(observed)), [3, 4])
     assert dark.reflectance is None, "nothing tells the reflectance where no return was observed"
 
 

@@ -232,7 +232,7 @@ def test_generate_compare_and_save(opened, served, tmp_path):
         assert time.monotonic() < end, sorted(path.name for path in tmp_path.iterdir())
         time.sleep(0.05)
     generator = made("lidargrit")[0]
-    wanted = unproject(generator.sample([5], generator.Sampling(temperature=0.5))[0])
+    wanted = unproject(generator.sample([5], sampling=generator.Sampling(temperature=0.5))[0])
     for path in files:
         assert torch.allclose(read_scan(path).points_xyz_m, wanted.points_xyz_m, atol=1e-4), path.name
     opened.click("[data-part=remove]")

@@ -34,8 +34,8 @@ class BegunError(Exception):
     ("name", "other", "changed"), [("r2dm", "steps", {"resamples": 2}), ("dusty", "search_steps", {"search_rate": 0.5})]
 )
 def test_settings_that_were_left_alone_are_those_of_what_is_done(name, other, changed, scan_file, monkeypatch):
-    def begin(*given):
-        raise BegunError(given[-1])
+    def begin(*given, sampling=None):
+        raise BegunError(given[-1] if sampling is None else sampling)
 
     model = made(name)[0]
     monkeypatch.setattr(model, "sample", begin)

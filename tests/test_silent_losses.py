@@ -24,7 +24,7 @@ from lidargrit.data.prepared.prepare import prepare, prepare_and_describe
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.data.prepared.workers import make_some_shards
 from lidargrit.data.sources import open_source
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fit_sensor import fit_sensor
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
@@ -236,7 +236,7 @@ def test_names_of_files_do_not_reach_the_terminal_as_they_are(tmp_path, capsys):
 def test_a_condition_of_another_size_than_its_sensor_is_refused():
     known, range_m = torch.zeros(1, 64, 32, dtype=torch.bool), torch.zeros(1, 64, 32)
     with pytest.raises(ConfigError, match="range_m of"):
-        Condition(range_m, known, known, known, K360.with_columns(64))
+        Observed(range_m, known, known, known, K360.with_columns(64))
 
 
 class Heard(Reporter):

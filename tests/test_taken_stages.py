@@ -28,7 +28,7 @@ def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
     assert not (tmp_path / "second" / "transformer").exists()
     for name, weight in first.state_dict().items():
         assert torch.equal(weight, second.state_dict()[name]), name
-    assert torch.equal(first.sample([2]).range_m, second.sample([2], TokenSampling(mask="bernoulli")).range_m)
+    assert torch.equal(first.sample([2]).range_m, second.sample([2], sampling=TokenSampling(mask="bernoulli")).range_m)
 
 
 def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):

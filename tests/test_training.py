@@ -22,6 +22,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
@@ -140,21 +141,23 @@ def test_a_finished_run_is_not_trained_again(whole):
 
 def test_batches_depend_on_the_scans_seen_alone(images):
     batches = Batches(images, 4, ("flip", "roll", "geometric"), True, seed=3)
-    in_order = [batches.at(seen) for seen in (0, 4, 8)]
-    again = Batches(images, 4, ("flip", "roll", "geometric"), True, seed=3).at(8)
+    in_order = [batches.at(seen).images for seen in (0, 4, 8)]
+    again = Batches(images, 4, ("flip", "roll", "geometric"), True, seed=3).at(8).images
     assert torch.equal(in_order[2].range_m, again.range_m)
     assert not torch.equal(in_order[0].range_m, in_order[1].range_m)
 
 
 def test_an_epoch_shows_every_scan_once_and_processes_share_it(images):
-    whole = Batches(images, 6, (), False, seed=0).at(6)
+    whole = Batches(images, 6, (), False, seed=0).at(6).images
     assert {float(r.sum()) for r in whole.range_m} == {float(r.sum()) for r in images.batch(range(6)).range_m}
-    parts = [Batches(images, 6, (), False, seed=0, rank=rank, world_size=3).at(6) for rank in range(3)]
+    parts = [Batches(images, 6, (), False, seed=0, rank=rank, world_size=3).at(6).images for rank in range(3)]
     assert torch.equal(torch.cat([part.range_m for part in parts]), whole.range_m)
 
 
 def test_other_columns_of_the_same_scan_can_be_kept(images):
-    kept = {tuple(Batches(images, 1, (), True, seed=0).at(seen).range_m[0, 40].tolist()) for seen in range(0, 60)}
+    kept = {
+        tuple(Batches(images, 1, (), True, seed=0).at(seen).images.range_m[0, 40].tolist()) for seen in range(0, 60)
+    }
     assert len(kept) > 12  # of 6 scans at most 6 without it
 
 
@@ -165,7 +168,7 @@ class OneWeight(Objective):
         super().__init__(sensor)
         self.weight = torch.nn.Parameter(torch.rand(1))
 
-    def forward(self, images, rng, player=""):
+    def forward(self, example, rng, player=""):
         return {"loss": self.weight.sum()}
 
 
@@ -301,7 +304,7 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
     vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     optimiser = make_optimiser(vqvae, TrainingConfig(scans=1, batch_size=1, learning_rate=1e-3))
     average = WeightAverage(vqvae, 1)
-    vqvae(images.batch([0]), torch.Generator())["loss"].backward()
+    vqvae(Example(images.batch([0])), torch.Generator())["loss"].backward()
     optimiser.step()
     held = [*vqvae.state_dict().values(), *average.objective.state_dict().values()]
     held += [parameter.grad for parameter in vqvae.parameters() if parameter.grad is not None]

@@ -9,6 +9,7 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.generation.presets import load_preset
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.ultralidar import codebook_care
@@ -72,7 +73,7 @@ def test_both_stages_learn():
         objective, found = generator.objective(stage).train(), []
         optimiser = torch.optim.Adam([p for p in objective.parameters() if p.requires_grad], lr=0.01)
         for step in range(40):
-            terms = objective(images, torch.Generator().manual_seed(step))
+            terms = objective(Example(images), torch.Generator().manual_seed(step))
             optimiser.zero_grad()
             terms["loss"].backward()
             optimiser.step()
@@ -88,7 +89,7 @@ def test_flips_mirror_the_voxels_of_some_scans():
     seen = []
     generator = made(replace(TINY, flips=True))
     generator.autoencoder.encoder.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
-    generator.objective("autoencoder")(images, torch.Generator().manual_seed(0))
+    generator.objective("autoencoder")(Example(images), torch.Generator().manual_seed(0))
     ways = [plain, plain.flip(-1), plain.flip(-2), plain.flip(-1, -2)]
     found = [[torch.equal(scan, way[index].float()) for way in ways] for index, scan in enumerate(seen[0])]
     assert all(any(one) for one in found)
@@ -151,7 +152,7 @@ def test_its_own_voxels_are_those_of_its_images():
     assert voxels.dtype == torch.bool
     grid = TINY.autoencoder.grid
     for points in ("exact", "reference"):
-        images = generator.sample([3, 4], replace(QUICK, points=points))
+        images = generator.sample([3, 4], sampling=replace(QUICK, points=points))
         assert torch.equal(images.range_m, images_of_voxels(voxels, grid, SENSOR, points).range_m)
     with pytest.raises(ConfigError, match="no seeds"):
         generator.sample_voxels([])

@@ -11,6 +11,7 @@ import torch
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss, upright_and_thin
 from lidargrit.nn.convolution import FoldedUpsample, Upsample
+from lidargrit.scans.example import Example
 from lidargrit.scans.projection import RangeEncoding
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, TokenGrid
@@ -120,7 +121,7 @@ def test_every_objective_is_finite_and_reaches_every_weight(reconstruction, rayd
     sensor = sensor_of(16, 32)
     config = replace(SMALL, reconstruction=reconstruction, raydrop_loss=raydrop_loss)
     vqvae = Vqvae(config, sensor).train()
-    terms = vqvae(images_of(sensor), torch.Generator().manual_seed(0))
+    terms = vqvae(Example(images_of(sensor)), torch.Generator().manual_seed(0))
     terms["loss"].backward()
     assert bool(terms["loss"].isfinite())
     assert ("raydrop" in terms) == raydrop_loss
@@ -136,7 +137,7 @@ def test_errors_in_metres_are_those_of_the_linear_encoding(range_encoding, raydr
     vqvae, images = Vqvae(config, sensor).eval(), images_of(sensor)
     linear = RangeEncoding("linear", sensor.range_min_m, sensor.range_max_m)
     with torch.no_grad():
-        terms = vqvae(images, torch.Generator())
+        terms = vqvae(Example(images), torch.Generator())
         decoded_m = vqvae.decode(vqvae.encode(images)).range_m
         encoded = linear.encode(decoded_m, torch.ones_like(images.return_mask))
         error = (encoded - linear.encode(images.range_m, images.return_mask)).abs()

@@ -21,7 +21,7 @@ MISTAKES = {
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
     "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
-    "list metric": "generators, metrics, protocols, sample-formats or presets; choose one",
+    "list metric": "wanted one such as metrics; see: lidargrit list --help",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol, --projection or --projection-variant; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",

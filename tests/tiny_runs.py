@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 
 from lidargrit.generation.objective import Objective
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.network import CompletionNetworkConfig
@@ -64,7 +65,7 @@ def learn(objective: Objective, images: RangeImage, seeds: Iterable[int], learni
     optimiser = torch.optim.Adam(objective.parameters(), lr=learning_rate)
     found = []
     for seed in seeds:
-        terms = objective(images, torch.Generator().manual_seed(seed))
+        terms = objective(Example(images), torch.Generator().manual_seed(seed))
         optimiser.zero_grad()
         terms["loss"].backward()
         optimiser.step()
@@ -72,11 +73,11 @@ def learn(objective: Objective, images: RangeImage, seeds: Iterable[int], learni
     return found
 
 
-def every_fourth_row(images: RangeImage) -> Condition:
+def every_fourth_row(images: RangeImage) -> Observed:
     """Return what is known of scans whose every fourth row is observed."""
     observed = torch.zeros_like(images.return_mask)
     observed[:, 2::4] = True
-    return Condition.of_pixels(images, observed)
+    return Observed.of_pixels(images, observed)
 
 
 def save_bundle(

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from lidargrit.core import discovery
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, MaskDecoding, RangeImage, TokenGrid
 
@@ -81,8 +82,9 @@ class ToyTokenizer(Tokenizer[ToyConfig]):
         """Return 0: nothing is multiplied."""
         return 0
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error of the ranges' logarithms and the cross-entropy of returns."""
+        images = example.images
         decoded, mask = self.decode(self.encode(images)), images.return_mask
         error = (decoded.range_m.log() - images.range_m.clamp(self.sensor.range_min_m).log()).abs()[mask].mean()
         raydrop = F.binary_cross_entropy_with_logits(decoded.return_logits, mask.float())

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from lidargrit.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from lidargrit.api import Condition, evaluate, inspect, load, load_scan, load_sensor, project, simulate, unproject
+    from lidargrit.api import Observed, evaluate, inspect, load, load_scan, load_sensor, project, simulate, unproject
 
-__all__ = ["Condition", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = ["Observed", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 
 
 def __getattr__(name: str) -> Any:

@@ -10,13 +10,13 @@ from lidargrit.data.formats import BadPoints
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import load
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import inspect, project, unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate
 
-__all__ = ["Condition", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = ["Observed", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
 
 
 def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:

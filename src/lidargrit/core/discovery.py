@@ -19,6 +19,7 @@ FOLDERS: Final = {
     "sensors": "scans/sensors",
     "tokenizers": "generation/tokenizers",
     "generators": "systems",
+    "conditions": "generation/conditions",
     "metrics": "evaluation/metrics",
     "protocols": "evaluation/protocols",
     "sample-formats": "data/sources/sample_formats",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
@@ -12,6 +12,8 @@ from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.scans.augmentation import Augmentation, augment
+from lidargrit.scans.condition import NOTHING, Condition
+from lidargrit.scans.example import Example
 from lidargrit.scans.types import RangeImage
 
 _THREADS_AT_MOST = 128
@@ -30,6 +32,7 @@ class Batches:
         rank: number of this process, from 0; it takes its share of every batch.
         world_size: number of processes that train together.
         workers: number of threads that read ahead.
+        condition_of: function from a batch of images to what a generator is told of each; nothing if not given.
     """
 
     def __init__(
@@ -42,6 +45,7 @@ class Batches:
         rank: int = 0,
         world_size: int = 1,
         workers: int = 1,
+        condition_of: Callable[[RangeImage], Condition] | None = None,
     ) -> None:
         if batch_size % world_size:
             raise ConfigError(
@@ -51,12 +55,12 @@ class Batches:
             )
         self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
         self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
-        self.workers = workers
+        self.workers, self._condition_of = workers, condition_of
         self._epoch, self._order = -1, torch.empty(0)
 
-    def stream(self, scans_seen: int, until: int) -> Iterator[RangeImage]:
+    def stream(self, scans_seen: int, until: int) -> Iterator[Example]:
         """Yield the batches from ``scans_seen`` scans on, up to the last that begins before ``until`` scans."""
-        waiting: deque[Future[RangeImage]] = deque()
+        waiting: deque[Future[Example]] = deque()
         threads = min(self.workers, _THREADS_AT_MOST)
         with ThreadPoolExecutor(threads, thread_name_prefix="reading scans") as pool:
             try:
@@ -69,7 +73,7 @@ class Batches:
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
 
-    def at(self, scans_seen: int) -> RangeImage:
+    def at(self, scans_seen: int) -> Example:
         """Return this process's share of the batch that follows ``scans_seen`` scans."""
         return self._read(*self._chosen(scans_seen))
 
@@ -79,14 +83,15 @@ class Batches:
         positions = range(scans_seen + self.rank * share, scans_seen + (self.rank + 1) * share)
         return [self._scan_at(position) for position in positions], [derive_seed(self.seed, 1, p) for p in positions]
 
-    def _read(self, indices: list[int], seeds: list[int]) -> RangeImage:
+    def _read(self, indices: list[int], seeds: list[int]) -> Example:
         # Each scan has its own random numbers, so that it looks the same however many processes share a batch.
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
         images = self.images.batch(indices, columns if self.any_columns else None)
-        if not self.augmentations:
-            return images
-        return RangeImage.stack([augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)])
+        if self.augmentations:
+            each = [augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)]
+            images = RangeImage.stack(each)
+        return Example(images, NOTHING if self._condition_of is None else self._condition_of(images))
 
     def _scan_at(self, position: int) -> int:
         epoch, index = divmod(position, len(self.images))

@@ -22,7 +22,7 @@ from lidargrit.evaluation.metrics import load_metric
 from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.patterns import Pattern
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 
@@ -117,7 +117,7 @@ def compare_completion(
             if not bool((whole.return_mask.cpu() & ~torch.stack(masks)).any()):
                 got = f"--observed {pattern.text}, which hides no return of these scans"
                 raise UsageError(got, "pixels that leave some returns out", "observe others, as rows:4")
-            condition = Condition.of_pixels(whole, torch.stack(masks))
+            condition = Observed.of_pixels(whole, torch.stack(masks))
             of_pattern = []
             for model in models:
                 of_pattern.append(_score(model, pattern, whole, condition, completions, seed))
@@ -180,7 +180,7 @@ def _check(model: Model, images: RangeImages, reporter: Reporter) -> None:
 
 
 def _score(
-    model: Model, pattern: Pattern, whole: RangeImage, condition: Condition, completions: int, seed: int
+    model: Model, pattern: Pattern, whole: RangeImage, condition: Observed, completions: int, seed: int
 ) -> _OfPattern:
     turns = completions if model.generator.is_random else 1
     begin = time.perf_counter()
@@ -220,7 +220,7 @@ def _score(
     return _OfPattern(score, errors)
 
 
-def _complete(model: Model, condition: Condition, turn: int, seed: int) -> RangeImage:
+def _complete(model: Model, condition: Observed, turn: int, seed: int) -> RangeImage:
     parts = []
     for first in range(0, len(condition), model.generator.compute_batch):
         some = condition[first : first + model.generator.compute_batch]

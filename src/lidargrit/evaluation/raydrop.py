@@ -14,7 +14,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.realism import SimulatedScans, distance, drop_independently
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import ranges_from_others
 from lidargrit.scans.types import MetricResult, RangeImage
 
@@ -69,7 +69,7 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
     for first in range(0, len(clean), generator.compute_batch):
         some = clean[first : first + generator.compute_batch]
         seeds = range(first, first + len(some))
-        dropped.append(generator.complete(Condition.of_surfaces(some), seeds).to("cpu"))
+        dropped.append(generator.complete(Observed.of_surfaces(some), seeds).to("cpu"))
     by_model = RangeImage.cat(dropped)
     independent = drop_independently(clean, float(true.return_mask.float().mean()))
     half = len(true) // 2

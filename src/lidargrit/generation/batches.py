@@ -10,7 +10,7 @@ import numpy as np
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import SEED_AT_MOST
-from lidargrit.scans.condition import KINDS, Condition, ConditionKind
+from lidargrit.scans.condition import KINDS, ConditionKind, Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -82,7 +82,7 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
             raise ConfigError(f"the seed {str(seed)[:30]}", "a whole number from 0 to 2^32 - 1", "choose another seed")
 
 
-def check_images(images: RangeImage | Condition, sensor: SensorModel) -> None:
+def check_images(images: RangeImage | Observed, sensor: SensorModel) -> None:
     """Refuse a single image, an empty batch, and images whose pixels are other rays than the sensor's."""
     if images.range_m.ndim != 3 or not len(images):
         raise ConfigError(
@@ -98,8 +98,8 @@ def check_images(images: RangeImage | Condition, sensor: SensorModel) -> None:
         )
 
 
-def check_condition(condition: Condition, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
-    """Refuse a condition of other rays, and one of a kind that a generator does not take.
+def check_observed(condition: Observed, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
+    """Refuse observations of other rays, and those of a kind that a generator does not take.
 
     Args:
         condition: condition that a caller gave.
@@ -107,10 +107,6 @@ def check_condition(condition: Condition, kinds: Collection[ConditionKind], sens
         sensor: sensor of the generator.
         name: name of the generator, for the message.
     """
-    if not isinstance(condition, Condition):
-        raise ConfigError(
-            f"a condition of type {type(condition).__name__}", "a Condition", "make one, such as Condition.of_pixels()"
-        )
     check_images(condition, sensor)
     if not condition.kinds <= set(kinds):
         raise ConfigError(

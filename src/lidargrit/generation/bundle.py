@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Generic, TypeVar
 
 from lidargrit.data.run_folder import Job
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 
 RunT = TypeVar("RunT")
 
@@ -21,7 +21,7 @@ class Bundle(Generic[RunT]):
     def __init__(self, runs: Mapping[Job, Callable[[], RunT]]) -> None:
         self._runs, self._read = runs, dict[Job, RunT]()
 
-    def shares(self, condition: Condition) -> Iterator[tuple[RunT | None, list[int]]]:
+    def shares(self, condition: Observed) -> Iterator[tuple[RunT | None, list[int]]]:
         """Yield each run with the indices of the scans that it completes; None for those that no run was trained for.
 
         Args:
@@ -37,7 +37,7 @@ class Bundle(Generic[RunT]):
         return self._read.get(job)
 
 
-def job_of(condition: Condition) -> Job:
+def job_of(condition: Observed) -> Job:
     """Return the job that completes a scan: ``raydrop`` where all surfaces are known, ``complete`` where pixels are.
 
     A scan of which nothing is known, or parts of both kinds, is left to the run that samples.

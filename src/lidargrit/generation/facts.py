@@ -13,7 +13,6 @@ CAPABILITIES = {  # name → what a generator with it can do besides sampling, f
     "complete": "fill in the pixels of a scan that were not observed",
     "invert": "invert a scan: search the latent whose scan is nearest to it",
     "likelihood": "compute the likelihood of a scan",
-    "segment": "tell the class of each return of a scan",
 }
 
 

@@ -15,7 +15,7 @@ from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import WEIGHTS_FILE, Job, is_bundle, locate, named_folder
-from lidargrit.generation.batches import BatchSeeds, check_condition, check_images, check_seeds, in_batches, one_by_one
+from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
 from lidargrit.generation.bundle import Bundle
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
 from lidargrit.generation.objective import Objective
@@ -23,7 +23,7 @@ from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.saved import ConfigT, SavedModel, download, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
-from lidargrit.scans.condition import Condition, ConditionKind
+from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing, Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, ScanBits
 
@@ -47,8 +47,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
 
     capabilities: ClassVar[frozenset[str]] = frozenset()
-    needs_condition: ClassVar[bool] = False
-    """Whether it only completes scans, and has no new ones to sample."""
     is_random: ClassVar[bool] = True
     """Whether two seeds give two scans."""
     bundle: Bundle[Generator[Any, Any]] | None = None
@@ -89,8 +87,13 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return configuration.override(settings, words, f"{verb} with {cls.public_name()!r}", cure, unread)
 
     @property
+    def takes(self) -> frozenset[type[Condition]]:
+        """Types of conditions that :meth:`sample` takes; ``Nothing`` is among them if it has new scans to sample."""
+        return frozenset({Nothing, Observed} if "complete" in self.capabilities else {Nothing})
+
+    @property
     def conditions(self) -> frozenset[ConditionKind]:
-        """Kinds of conditions that :meth:`complete` accepts; they may depend on ``config``."""
+        """Kinds of observations that it completes scans from; they may depend on ``config``."""
         return frozenset({"pixels"} if "complete" in self.capabilities else set())
 
     @property
@@ -132,37 +135,53 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @torch.no_grad()
-    def sample(self, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
+    def sample(
+        self, seeds: Sequence[int], condition: Condition = NOTHING, sampling: SamplingT | None = None
+    ) -> RangeImage:
         """Generate one scan for each seed; a seed gives the same scan whatever the others are, bit for bit.
+
+        What was observed of a scan is kept, bit for bit. Reflectance and labels that the generator does not write are
+        filled in from observed returns; a batch has them if any of its scans has observed some. A generator that was
+        read from a bundle leaves each scan to the bundle's run for what was observed of it, unless it is given settings
+        of its own sampling.
 
         Args:
             seeds: seeds, one for each scan, from 0 to 2^32 - 1.
-            sampling: settings of the generator's own ``Sampling``; its defaults if not given.
+            condition: condition of a type in :attr:`takes`, of as many scans as seeds;
+                ``Observed.of_pixels(images, observed)`` completes scans.
+            sampling: settings of the generator's own ``Sampling``; its defaults if not given, and
+                :meth:`completion_sampling` for what was observed.
 
         Raises:
-            ConfigError: no seed or one out of bounds, settings of another generator, or one that only completes scans.
+            ConfigError: seeds that are none, too many, too few or out of bounds, settings of another generator, images
+                of other rays, or a condition that the generator does not take.
 
         Example::
 
             lidargrit.load("runs/demo").sample(seeds=[0, 1, 2, 3])
         """
-        if self.needs_condition:
-            got, cure = (
-                f"a generator {self.public_name()!r}, which has no new scans to sample",
-                self.facts.first_command,
-            )
-            raise ConfigError(got, "one that samples", f"use it with: lidargrit {cure}")
-        check_seeds(seeds)
-        settings = self._settings(sampling, self.Sampling)
+        self._check_condition(condition)
+        check_seeds(seeds, None if isinstance(condition, Nothing) else len(condition))
+        known = condition.to(self.device)
         self.eval()
-        return in_batches(seeds, self.compute_batch, lambda _, some: self._sample(some, settings))
+        if isinstance(known, Observed):
+            return self._completed(known, seeds, sampling)
+        settings = self._settings(sampling, self.Sampling)
+        return known.put_into(
+            in_batches(seeds, self.compute_batch, lambda at, some: self._sample(some, known[at], settings))
+        )
+
+    @final
+    def complete(self, condition: Observed, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
+        """Return scans that keep all observed values and generate the rest: :meth:`sample` with an ``Observed``."""
+        return self.sample(seeds, condition, sampling)
 
     @final
     def stream(self, seeds: Iterable[int], sampling: SamplingT | None = None) -> Iterator[RangeImage]:
         """Yield the scans of :meth:`sample` one by one; seeds may be without end, such as ``itertools.count(0)``."""
         remaining = iter(seeds)
         while some := list(islice(remaining, self.compute_batch)):
-            images = self.sample(some, sampling)
+            images = self.sample(some, sampling=sampling)
             yield from (images[index] for index in range(len(images)))
 
     @abstractmethod
@@ -191,51 +210,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @torch.no_grad()
-    def complete(
-        self,
-        condition: Condition,
-        seeds: Sequence[int],
-        sampling: SamplingT | None = None,
-    ) -> RangeImage:
-        """Return scans that keep all observed values, bit for bit, and generate the rest (capability ``complete``).
-
-        Reflectance and labels that the generator does not write are filled in from the observed returns; a batch has
-        them if any of its scans has observed some. A generator that was read from a bundle leaves each scan to the
-        bundle's run for what is known of it, unless it is given settings of its own sampling.
-
-        Args:
-            condition: observed part of each scan, such as ``Condition.of_pixels(images, observed)``, of the kinds in
-                :attr:`conditions`.
-            seeds: seeds, one for each scan, from 0 to 2^32 - 1.
-            sampling: settings of the generator's own ``Sampling``; :meth:`completion_sampling` if not given.
-
-        Raises:
-            ConfigError: images of other rays, a condition of a kind that the generator does not take, seeds that are
-                too many, too few or out of bounds, settings of another generator, or one without the capability.
-        """
-        from lidargrit.scans.fills import fill_lacking  # noqa: PLC0415  loads scipy, and only this needs it
-
-        self._require("complete")
-        check_condition(condition, self.conditions, self.sensor, self.public_name())
-        check_seeds(seeds, len(condition))
-        settings, condition = self._settings(sampling, self.completion_sampling), condition.to(self.device)
-        shares = [(None, [*range(len(seeds))])]
-        if sampling is None and self.bundle is not None:
-            shares = self.bundle.shares(condition)
-        found: dict[int, RangeImage] = {}
-        for run, indices in shares:
-            some, own = condition[indices], [seeds[index] for index in indices]
-            part = self._completed(some, own, settings) if run is None else run.to(self.device).complete(some, own)
-            found |= {index: part[[at]] for at, index in enumerate(indices)}
-        generated = RangeImage.cat([found[index] for index in range(len(seeds))])
-        return condition.put_into(fill_lacking(generated, condition))
-
-    def _completed(self, condition: Condition, seeds: Sequence[int], sampling: SamplingT) -> RangeImage:
-        self.eval()
-        return in_batches(seeds, self.compute_batch, lambda at, some: self._complete(condition[at], some, sampling))
-
-    @final
-    @torch.no_grad()
     def invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
         """Return for each scan the nearest one that the generator can generate (capability ``invert``).
 
@@ -245,7 +219,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
 
         Raises:
-            ConfigError: see :meth:`complete`.
+            ConfigError: see :meth:`sample`.
         """
         self._require("invert")
         check_images(images, self.sensor)
@@ -253,19 +227,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
         self.eval()
         return in_batches(seeds, self.compute_batch, lambda at, some: self._invert(images[at], some, settings))
-
-    @final
-    @torch.no_grad()
-    def segment(self, images: RangeImage) -> RangeImage:
-        """Return scans with a label for each return, each computed by itself (capability ``segment``).
-
-        Args:
-            images: batch of range images (B, H, W); labels that they have are not read.
-        """
-        self._require("segment")
-        check_images(images, self.sensor)
-        self.eval()
-        return RangeImage.cat([self._segment(image) for image in one_by_one(images.to(self.device))])
 
     @final
     @torch.no_grad()
@@ -292,11 +253,14 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         rounded = steps.round(images.to(self.device))
         return ScanBits.cat([self._bits(image, steps, expected) for image in one_by_one(rounded)])
 
-    def _sample(self, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
-        """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out."""
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: SamplingT) -> RangeImage:
+        """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out.
+
+        The condition is of a type in :attr:`takes`, and no ``Observed``.
+        """
         raise NotImplementedError
 
-    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         """Generate scans that agree with the observed values, which the caller then puts in."""
         raise NotImplementedError
 
@@ -307,13 +271,42 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Encode and decode a batch of one scan."""
         raise NotImplementedError
 
-    def _segment(self, images: RangeImage) -> RangeImage:
-        """Label a batch of one scan."""
-        raise NotImplementedError
-
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         """Return the bits of a batch of one scan."""
         raise NotImplementedError
+
+    def _check_condition(self, condition: Condition) -> None:
+        if isinstance(condition, Observed):
+            self._require("complete")
+            check_observed(condition, self.conditions, self.sensor, self.public_name())
+        if type(condition) not in self.takes:
+            kind, wanted = type(condition).__name__, ", ".join(sorted(one.__name__ for one in self.takes))
+            got = "no condition" if isinstance(condition, Nothing) else f"a condition of type {kind}"
+            cure = f"use it with: lidargrit {self.facts.first_command}"
+            wanted = f"one of type {wanted}" if wanted else "a generator that samples"
+            raise ConfigError(f"{got} for {self.public_name()!r}", wanted, cure)
+
+    def _completed(self, known: Observed, seeds: Sequence[int], sampling: SamplingT | None) -> RangeImage:
+        """Complete each scan, by the bundle's run for what was observed of it if there is one."""
+        from lidargrit.scans.fills import fill_lacking  # noqa: PLC0415  loads scipy, and only this needs it
+
+        settings = self._settings(sampling, self.completion_sampling)
+        shares = [(None, [*range(len(seeds))])]
+        if sampling is None and self.bundle is not None:
+            shares = self.bundle.shares(known)
+        found: dict[int, RangeImage] = {}
+        for run, indices in shares:
+            some, own = known[indices], [seeds[index] for index in indices]
+            if run is None:
+                part = in_batches(own, self.compute_batch, partial(self._complete_batch, some, settings))
+            else:
+                part = run.to(self.device).sample(own, some)
+            found |= {index: part[[at]] for at, index in enumerate(indices)}
+        generated = RangeImage.cat([found[index] for index in range(len(seeds))])
+        return known.put_into(fill_lacking(generated, known))
+
+    def _complete_batch(self, known: Observed, sampling: SamplingT, at: list[int], seeds: BatchSeeds) -> RangeImage:
+        return self._complete(known[at], seeds, sampling)
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
         if given is not None and not isinstance(given, self.Sampling):

@@ -1,4 +1,4 @@
-"""What a stage of training minimises: (range images, random numbers) → the terms of a loss."""
+"""What a stage of training minimises: (examples, random numbers) → the terms of a loss."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor, nn
 
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
 
 class Objective(nn.Module, ABC):
-    """A loss over batches of range images; its parameters are what the stage trains.
+    """A loss over batches of examples; its parameters are what the stage trains.
 
     Args:
         sensor: sensor whose range images the objective takes.
@@ -47,11 +48,11 @@ class Objective(nn.Module, ABC):
         self.sensor = sensor
 
     @abstractmethod
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the terms of the loss as scalars: ``loss``, which is minimised, and beside it what is worth logging.
 
         Args:
-            images: batch of range images (B, H, W).
+            example: batch of range images with what is known of each.
             rng: random numbers, on the device of the images.
             player: one of ``players``; "" where there are none.
         """

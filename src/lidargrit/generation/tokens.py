@@ -25,7 +25,8 @@ from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.fills import fill_from_nearest
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, ScanBits, TokenGrid
@@ -141,7 +142,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         mask: PixelChoice,
         pixels: PixelSampling,
         tokenizer: Tokenizer,
-        condition: Condition | None = None,
+        condition: Observed | None = None,
     ) -> RangeImage:
         """Decode sampled tokens to scans: those that are wanted, and the rest of the last one's batch.
 
@@ -168,7 +169,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
                 images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
         return RangeImage.cat(images)
 
-    def observed_tokens(self, condition: Condition) -> Int[Tensor, "B T"]:
+    def observed_tokens(self, condition: Observed) -> Int[Tensor, "B T"]:
         """Return the tokens of all cells with an observed pixel, and -1 for the others.
 
         They are the tokens of scans in which every unobserved pixel is a copy of the nearest observed one by angle.
@@ -255,11 +256,12 @@ class PixelObjective(Objective):
         self._decoding = None if tokenizer is None else Frozen(tokenizer.for_decoding("fp32"))
         self.over = () if tokenizer is None else ("tokenizer",)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the nats of the mask a pixel plus those of the range a return as ``loss``, and each of them in bits.
 
         In training some phases of each scan stand for all; in validation all are counted.
         """
+        images = example.images
         decoded = None
         if self._tokens is not None and self._decoding is not None:
             tokenizer = self._decoding.network(images.range_m.device)

@@ -1,10 +1,11 @@
-"""The observed part of a scan that is to be completed: range images and masks → :class:`Condition`."""
+"""What is known of scans that are to be generated: nothing, or range images and masks → :class:`Observed`."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,8 +13,11 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage
+from lidargrit.scans.types import RangeImage, sensor_of_all
 
+ConditionT = TypeVar("ConditionT", bound="Condition")
+NothingT = TypeVar("NothingT", bound="Nothing")
+ObservedT = TypeVar("ObservedT", bound="Observed")
 ConditionKind = Literal["pixels", "surfaces"]
 """What a condition knows of a pixel: whether the beam returned, and how far; or only how far the surface is."""
 
@@ -23,8 +27,49 @@ KINDS: dict[ConditionKind, str] = {
 }
 
 
+class Condition(ABC):
+    """What is known of each scan of a batch; a generator generates scans of which it holds.
+
+    A subclass holds tensors of its own, the first axis of each for the scans.
+    """
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of scans."""
+
+    @abstractmethod
+    def __getitem__(self: ConditionT, index: slice | list[int]) -> ConditionT:
+        """Return what is known of some of the scans."""
+
+    @abstractmethod
+    def to(self: ConditionT, device: torch.device | str) -> ConditionT:
+        """Return it with its tensors on another device."""
+
+    def put_into(self, generated: RangeImage) -> RangeImage:
+        """Return generated scans in which all that is known pixel by pixel stands as it is known."""
+        return generated
+
+
+@dataclass(frozen=True)
+class Nothing(Condition):
+    """Nothing is known, of as many scans as are asked for."""
+
+    def __len__(self) -> int:
+        return 0
+
+    def __getitem__(self: NothingT, index: slice | list[int]) -> NothingT:
+        return self
+
+    def to(self: NothingT, device: torch.device | str) -> NothingT:
+        """Return itself."""
+        return self
+
+
+NOTHING = Nothing()
+
+
 @dataclass(frozen=True, eq=False)
-class Condition:
+class Observed(Condition):
     """The observed part of a batch of scans, on the sensor's grid; everything else is generated.
 
     Every quantity has a mask of its own that says where it was observed. Values elsewhere have no influence.
@@ -54,9 +99,9 @@ class Condition:
     label: Int[Tensor, "B H W"] | None = None
 
     def __post_init__(self) -> None:
-        check_observed(self.range_observed, self.range_m)
-        check_observed(self.return_observed, self.range_m)
-        check_observed(self.return_mask, self.range_m, "a mask of returns")
+        _check_mask(self.range_observed, self.range_m)
+        _check_mask(self.return_observed, self.range_m)
+        _check_mask(self.return_mask, self.range_m, "a mask of returns")
         object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
@@ -79,14 +124,14 @@ class Condition:
                 raise ScanError(got, "values in [0, 1]", "scale it, e.g. divide an intensity of 0..255 by 255")
 
     @classmethod
-    def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Condition:
+    def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Observed:
         """Return the condition that some pixels of scans were observed, whether they have a return or not.
 
         Args:
             images: batch of range images (B, H, W); pixels that were not observed have no influence.
             observed: True for observed pixels.
         """
-        check_observed(observed, images.range_m)
+        _check_mask(observed, images.range_m)
         returned = images.return_mask & observed
         range_m = torch.where(returned, images.range_m, 0.0)
         reflectance = None if images.reflectance is None else torch.where(returned, images.reflectance, 0.0)
@@ -94,7 +139,7 @@ class Condition:
         return cls(range_m, returned, returned, observed, images.sensor, reflectance, label)
 
     @classmethod
-    def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> Condition:
+    def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> Observed:
         """Return the condition that the ranges of all surfaces are known, and that only surfaces can return.
 
         Args:
@@ -102,44 +147,44 @@ class Condition:
             unknown: True for pixels of which nothing is known; none if not given.
         """
         unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
-        check_observed(unknown, clean.range_m, "unknown pixels")
+        _check_mask(unknown, clean.range_m, "unknown pixels")
         hit = clean.return_mask & ~unknown
         label = None if clean.label is None else torch.where(hit, clean.label, 0)
         return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)
 
     @classmethod
-    def nothing(cls, sensor: SensorModel, count: int) -> Condition:
+    def nothing(cls, sensor: SensorModel, count: int) -> Observed:
         """Return the condition of a number of scans of which nothing was observed."""
         none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
         return cls(none.float(), none, none, none, sensor)
 
     @classmethod
-    def cat(cls, conditions: Sequence[Condition]) -> Condition:
+    def cat(cls: type[ObservedT], parts: Sequence[ObservedT]) -> ObservedT:
         """Return the conditions of several batches as one; reflectance and label are kept if every batch has them."""
-        reflectance = [one.reflectance for one in conditions if one.reflectance is not None]
-        label = [one.label for one in conditions if one.label is not None]
+        reflectance = [one.reflectance for one in parts if one.reflectance is not None]
+        label = [one.label for one in parts if one.label is not None]
         return cls(
-            torch.cat([one.range_m for one in conditions]),
-            torch.cat([one.range_observed for one in conditions]),
-            torch.cat([one.return_mask for one in conditions]),
-            torch.cat([one.return_observed for one in conditions]),
-            conditions[0].sensor,
-            torch.cat(reflectance) if len(reflectance) == len(conditions) else None,
-            torch.cat(label) if len(label) == len(conditions) else None,
+            torch.cat([one.range_m for one in parts]),
+            torch.cat([one.range_observed for one in parts]),
+            torch.cat([one.return_mask for one in parts]),
+            torch.cat([one.return_observed for one in parts]),
+            sensor_of_all([one.sensor for one in parts]),
+            torch.cat(reflectance) if len(reflectance) == len(parts) else None,
+            torch.cat(label) if len(label) == len(parts) else None,
         )
 
     def __len__(self) -> int:
         return len(self.range_m)
 
-    def __getitem__(self, index: slice | list[int]) -> Condition:
+    def __getitem__(self: ObservedT, index: slice | list[int]) -> ObservedT:
         """Return the conditions of some of the scans."""
         return self._mapped(lambda pixels: pixels[index])
 
-    def to(self, device: torch.device | str) -> Condition:
+    def to(self: ObservedT, device: torch.device | str) -> ObservedT:
         """Return the condition with its pixels on another device."""
         return self._mapped(lambda pixels: pixels.to(device))
 
-    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Condition:
+    def _mapped(self: ObservedT, change: Callable[[Tensor], Tensor]) -> ObservedT:
         return replace(
             self,
             range_m=change(self.range_m),
@@ -193,7 +238,7 @@ class Condition:
         return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)
 
 
-def check_observed(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
+def _check_mask(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:
     """Refuse a mask whose shape is not that of the ranges, with ConfigError that says ``what`` it is."""
     if range_m.ndim != 3:
         raise ConfigError(f"ranges of shape {tuple(range_m.shape)}", "(B, H, W), a batch of images", "add a batch axis")

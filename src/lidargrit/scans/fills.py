@@ -15,7 +15,7 @@ from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
 from lidargrit.core.errors import ScanError
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel, continuous_azimuths_rad
 from lidargrit.scans.types import RangeImage
 
@@ -26,7 +26,7 @@ _ROWS_NEAR, _COLUMNS_NEAR = 9, 17  # window in which a return helps to fill an u
 
 
 @dataclass(frozen=True)
-class Observed:
+class SeenScan:
     """The observed pixels of one scan, with the angles of its rays.
 
     Args:
@@ -44,7 +44,7 @@ class Observed:
     azimuth_rad: Float64[np.ndarray, " W"]
 
     @classmethod
-    def of(cls, condition: Condition, index: int) -> Observed:
+    def of(cls, condition: Observed, index: int) -> SeenScan:
         """Return the observed pixels of one scan of a condition."""
         observed = condition.return_observed[index]
         returned = condition.return_mask[index] & observed
@@ -72,12 +72,12 @@ class Observed:
         return self.range_m[self.nearest_return]
 
 
-def nearest(seen: Observed) -> Float64[np.ndarray, "H W"]:
+def nearest(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
     """Return for every pixel the range of the nearest observed return, in metres."""
     return seen.nearest_range_m
 
 
-def linear(seen: Observed) -> Float64[np.ndarray, "H W"]:
+def linear(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
     """Interpolate 1 / range along the row or the column, whichever has the nearer pair of observed returns.
 
     Where the two lie on different surfaces, the range is that of the one nearer by angle; without a pair it is that of
@@ -111,7 +111,7 @@ class Triangles:
     corner_pixels: Int64[np.ndarray, "3 H W"]
 
     @classmethod
-    def none(cls, seen: Observed, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
+    def none(cls, seen: SeenScan, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
         """Return the values for pixels without a triangle, from ranges that were filled in another way."""
         weights = np.zeros((3, *range_m.shape))
         weights[0] = 1
@@ -123,7 +123,7 @@ class Triangles:
         return (self.weights * pixels.ravel()[self.corner_pixels]).sum(0).astype(np.float32)
 
 
-def triangulate(seen: Observed) -> Triangles:
+def triangulate(seen: SeenScan) -> Triangles:
     """Triangulate the observed returns by the angles of their rays, in which 1 / range of a plane is nearly linear."""
     width = len(seen.azimuth_rad)
     near = maximum_filter1d(maximum_filter1d(~seen.observed, _ROWS_NEAR, 0), _COLUMNS_NEAR, 1, mode="wrap")
@@ -165,17 +165,17 @@ def triangulate(seen: Observed) -> Triangles:
     return found
 
 
-def triangulation(seen: Observed) -> Float64[np.ndarray, "H W"]:
+def triangulation(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
     """Interpolate 1 / range linearly in a Delaunay triangulation of the observed returns, within surfaces."""
     return seen.triangles.range_m
 
 
-def of_nearest(seen: Observed, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+def of_nearest(seen: SeenScan, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     """Return for every pixel a quantity of the nearest observed return."""
     return pixels[seen.nearest_return]
 
 
-def of_triangle(seen: Observed, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+def of_triangle(seen: SeenScan, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     """Interpolate a quantity of the observed returns in their triangulation, within surfaces."""
     return seen.triangles.weighed(pixels)
 
@@ -188,8 +188,8 @@ class Fill(NamedTuple):
         reflectance: observed pixels and their reflectance → reflectance of every pixel.
     """
 
-    range_m: Callable[[Observed], Float64[np.ndarray, "H W"]]
-    reflectance: Callable[[Observed, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]]
+    range_m: Callable[[SeenScan], Float64[np.ndarray, "H W"]]
+    reflectance: Callable[[SeenScan, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]]
 
 
 FILLS: dict[str, Fill] = {
@@ -200,7 +200,7 @@ FILLS: dict[str, Fill] = {
 """Classical methods by the name that a user types."""
 
 
-def fill_lacking(completed: RangeImage, condition: Condition) -> RangeImage:
+def fill_lacking(completed: RangeImage, condition: Observed) -> RangeImage:
     """Return completed scans with the reflectance and the labels that their observed parts have and they lack.
 
     Reflectance is that of :data:`FILLS` ``["triangulation"]``, 0 in scans none of whose observed pixels returned, and
@@ -216,7 +216,7 @@ def fill_lacking(completed: RangeImage, condition: Condition) -> RangeImage:
     lacks_labels = condition.label is not None and completed.label is None
     if not (lacks_reflectance or lacks_labels):
         return completed
-    scans = [Observed.of(condition, index) for index in range(len(condition))]
+    scans = [SeenScan.of(condition, index) for index in range(len(condition))]
     range_m, reflectance, label = completed.range_m, completed.reflectance, completed.label
     if lacks_reflectance:
         found = [_reflectance_of(condition, index, seen, of_triangle) for index, seen in enumerate(scans)]
@@ -226,7 +226,7 @@ def fill_lacking(completed: RangeImage, condition: Condition) -> RangeImage:
     return RangeImage.masked(range_m, completed.return_mask, completed.sensor, reflectance, label)
 
 
-def fill(method: str, condition: Condition) -> RangeImage:
+def fill(method: str, condition: Observed) -> RangeImage:
     """Fill ranges and reflectance in by a classical method, returns from the nearest observed pixel, and labels from
     the nearest observed return.
 
@@ -237,7 +237,7 @@ def fill(method: str, condition: Condition) -> RangeImage:
     sensor = condition.sensor
     ranges, masks, reflectances, labels = [], [], [], []
     for index in range(len(condition)):
-        seen = Observed.of(condition, index)
+        seen = SeenScan.of(condition, index)
         mask = seen.returned[seen.nearest(seen.observed)]
         some, by = bool(seen.returned.any()), FILLS[method]
         range_m = np.clip(by.range_m(seen), sensor.range_min_m, sensor.range_max_m) if some else seen.range_m
@@ -253,10 +253,10 @@ def fill(method: str, condition: Condition) -> RangeImage:
 
 
 def _reflectance_of(
-    condition: Condition,
+    condition: Observed,
     index: int,
-    seen: Observed,
-    method: Callable[[Observed, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]],
+    seen: SeenScan,
+    method: Callable[[SeenScan, Float32[np.ndarray, "H W"]], Float32[np.ndarray, "H W"]],
 ) -> Float[Tensor, "H W"]:
     """Return the reflectance of every pixel of a scan by a method; 0 where no return was observed."""
     assert condition.reflectance is not None
@@ -264,7 +264,7 @@ def _reflectance_of(
     return torch.from_numpy(method(seen, pixels) if seen.returned.any() else np.zeros_like(pixels)).clamp(0, 1)
 
 
-def _label_of(condition: Condition, index: int, seen: Observed) -> Int[Tensor, "H W"]:
+def _label_of(condition: Observed, index: int, seen: SeenScan) -> Int[Tensor, "H W"]:
     """Return for every pixel of a scan the label of the nearest observed return; 0 where there is none."""
     assert condition.label is not None
     label = condition.label[index].cpu()
@@ -313,7 +313,7 @@ def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
         half = coins.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width].to(device)
         range_m = torch.zeros(height, width, dtype=torch.float64)
         for given in (half, ~half):
-            seen = Observed.of(Condition.of_pixels(images[index : index + 1], given[None]), 0)
+            seen = SeenScan.of(Observed.of_pixels(images[index : index + 1], given[None]), 0)
             if not seen.returned.any():
                 raise ScanError("a scan with hardly any return", "returns on every side", "leave the scan out")
             range_m = torch.where(given.cpu(), range_m, torch.from_numpy(triangulation(seen)))

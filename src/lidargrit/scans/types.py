@@ -186,7 +186,7 @@ class RangeImage:
         return cls(
             join([image.range_m for image in images]),
             join([image.return_mask for image in images]),
-            images[0].sensor,
+            sensor_of_all([image.sensor for image in images]),
             join(reflectance) if len(reflectance) == len(images) else None,
             join(label) if len(label) == len(images) else None,
         )
@@ -211,6 +211,16 @@ class RangeImage:
             reflectance=None if self.reflectance is None else change(self.reflectance),
             label=None if self.label is None else change(self.label),
         )
+
+
+def sensor_of_all(sensors: Sequence[SensorModel]) -> SensorModel:
+    """Return the sensor of all images of a batch, or raise ConfigError where two have different rays."""
+    first = sensors[0]
+    for other in sensors:
+        if other is not first and not other.same_rays(first):
+            got = f"images of the sensors {first.name!r} and {other.name!r} in one batch"
+            raise ConfigError(got, "images of one sensor", "make a batch of each")
+    return first
 
 
 @dataclass(frozen=True, eq=False)

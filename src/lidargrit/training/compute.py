@@ -14,11 +14,13 @@ import torch
 
 from lidargrit.core.configuration import COUNTS_SCANS
 from lidargrit.core.errors import ConfigError
+from lidargrit.generation import conditions
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.precision import Precision
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.taken_stages import donors_of_stages
@@ -86,9 +88,9 @@ def stage_costs(preset: Preset, taken: Collection[str] | None = None) -> dict[st
         taken = donors_of_stages(preset, generator.stages) if taken is None else taken
         for stage in (name for name in generator.stages if name not in taken):
             try:
-                costs[stage] = _cost_without_values(generator, stage, sensor)
+                costs[stage] = _cost_without_values(preset, generator, stage, sensor)
             except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
-                costs[stage] = _cost_with_values(preset.build_generator(sensor), stage, sensor)
+                costs[stage] = _cost_with_values(preset, preset.build_generator(sensor), stage, sensor)
     return costs
 
 
@@ -204,13 +206,18 @@ def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
     return RangeImage(range_m, mask, sensor, torch.full_like(range_m, 0.65), label)
 
 
+def _uniform_examples(preset: Preset, sensor: SensorModel) -> Example:
+    images = uniform_images(sensor, _SCANS)
+    return Example(images, conditions.load(preset.data.condition).of(images))
+
+
 class _SeedOfNoValues(torch.Generator):
     """Random numbers for objectives that make them on the device of their source."""
 
     device = torch.device("meta")
 
 
-def _cost_without_values(generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
+def _cost_without_values(preset: Preset, generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
     """Count the operations of a stage's training, of a generator whose weights have no values."""
     with torch.device("meta"):
         objective = generator.objective(stage)
@@ -219,15 +226,15 @@ def _cost_without_values(generator: Generator, stage: str, sensor: SensorModel) 
         for name, buffer in module.named_buffers(recurse=False):
             if buffer.ndim == 0 and not buffer.is_floating_point():  # a counter, by which steps differ
                 module.register_buffer(name, torch.zeros_like(buffer, device="cpu"))
-    return _cost(objective, uniform_images(sensor, _SCANS).to("meta"), _SeedOfNoValues)
+    return _cost(objective, _uniform_examples(preset, sensor).to("meta"), _SeedOfNoValues)
 
 
-def _cost_with_values(generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
+def _cost_with_values(preset: Preset, generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
     """Count the operations of a stage's training by computing some of its steps."""
-    return _cost(generator.objective(stage), uniform_images(sensor, _SCANS), torch.Generator)
+    return _cost(generator.objective(stage), _uniform_examples(preset, sensor), torch.Generator)
 
 
-def _cost(objective: Objective, images: RangeImage, make_rng: Callable[[], torch.Generator]) -> StageCost:
+def _cost(objective: Objective, example: Example, make_rng: Callable[[], torch.Generator]) -> StageCost:
     """Count the operations of some steps of all players."""
     steps = min(objective.period, _STEPS_AT_MOST)
     objective.train()
@@ -235,5 +242,5 @@ def _cost(objective: Objective, images: RangeImage, make_rng: Callable[[], torch
         # Torch asks an image of which a penalty takes the gradient for one that was not kept, and warns itself of it.
         warnings.filterwarnings("ignore", "The .grad attribute of a Tensor")
         for step, player in product(range(steps), objective.players or ("",)):
-            objective(images, make_rng().manual_seed(step), player)["loss"].backward()
-    return StageCost(counter.total / (steps * len(images)), objective.preparation_flops)
+            objective(example, make_rng().manual_seed(step), player)["loss"].backward()
+    return StageCost(counter.total / (steps * len(example)), objective.preparation_flops)

@@ -21,7 +21,7 @@ from lidargrit.core.errors import ConfigError, LidarGritError, TrainingError
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of
-from lidargrit.scans.types import RangeImage
+from lidargrit.scans.example import Example
 
 
 class Engine:
@@ -109,13 +109,13 @@ class Engine:
         """Return whether a number is the same in all processes."""
         return not self.any(self.world_size > 1 and self._fabric.broadcast(number) != number)
 
-    def step(self, images: RangeImage, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
+    def step(self, example: Example, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
         """Take one step, or one for each player in turn, and return the loss terms, averaged over the processes.
 
         If a loss or a gradient is not finite in any process, no process changes its weights.
 
         Args:
-            images: this process's share of a batch (B, H, W).
+            example: this process's share of a batch.
             seed: seed of the objective's random numbers.
             gradient_clip: largest norm of the gradient; 0 for no limit.
             parts: number of parts of the share whose gradients are computed one after the other and added up.
@@ -123,18 +123,19 @@ class Engine:
         self._objective.train()
         terms: dict[str, Tensor] = {}
         for player in _turns(self._objective.objective):
-            found, is_finite = self._step(images, seed, gradient_clip, player, parts)
+            found, is_finite = self._step(example, seed, gradient_clip, player, parts)
             terms = _joined(terms, found, player)
             if not is_finite:
                 break
         return terms
 
     def _step(
-        self, images: RangeImage, seed: int, gradient_clip: float, player: str, parts: int
+        self, example: Example, seed: int, gradient_clip: float, player: str, parts: int
     ) -> tuple[dict[str, Tensor], bool]:
         terms: dict[str, Tensor] = {}
         for part in range(parts):
-            some = images if parts == 1 else images[part * len(images) // parts : (part + 1) * len(images) // parts]
+            first, last = (number * len(example) // parts for number in (part, part + 1))
+            some = example if parts == 1 else example[first:last]
             with self._fabric.no_backward_sync(self._objective, enabled=part < parts - 1):
                 found = self._objective(partial(_same, some), derive_seed(seed, part) if part else seed, player)
                 loss = self._mean(found["loss"].detach().clone())
@@ -160,7 +161,7 @@ class Engine:
         together = torch.stack([term.to(self.device, torch.float32) for term in terms.values()])
         return dict(zip(terms, self._mean(together).unbind(), strict=True))
 
-    def evaluate(self, objective: Objective, images: RangeImage, seed: int) -> dict[str, float]:
+    def evaluate(self, objective: Objective, example: Example, seed: int) -> dict[str, float]:
         """Return an objective's loss terms on a batch, in evaluation mode."""
         was_training = objective.training
         objective.eval()
@@ -168,28 +169,28 @@ class Engine:
         with torch.no_grad(), self._fabric.autocast():
             for player in _turns(objective):
                 rng = torch.Generator(self.device).manual_seed(seed)
-                terms = _joined(terms, objective(images.to(self.device), rng, player), player)
+                terms = _joined(terms, objective(example.to(self.device), rng, player), player)
         objective.train(was_training)
         return {name: float(term) for name, term in terms.items()}
 
 
 class _UncastInputs(nn.Module):
-    """Hands images to an objective unrounded: Fabric rounds every tensor argument to the training precision.
+    """Hands an example to an objective unrounded: Fabric rounds every tensor argument to the training precision.
 
-    The images are passed as a function that returns them.
+    The example is passed as a function that returns it.
     """
 
     def __init__(self, objective: Objective) -> None:
         super().__init__()
         self.objective = objective
 
-    def forward(self, images: Callable[[], RangeImage], seed: int, player: str) -> dict[str, Tensor]:
+    def forward(self, example: Callable[[], Example], seed: int, player: str) -> dict[str, Tensor]:
         device = next(self.objective.parameters()).device
-        return self.objective(images(), torch.Generator(device).manual_seed(seed), player)
+        return self.objective(example(), torch.Generator(device).manual_seed(seed), player)
 
 
-def _same(images: RangeImage) -> RangeImage:
-    return images
+def _same(example: Example) -> Example:
+    return example
 
 
 def _turns(objective: Objective) -> tuple[str, ...]:

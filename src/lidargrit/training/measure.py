@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from lidargrit.generation import conditions
 from lidargrit.generation.settings import Preset
+from lidargrit.scans.example import Example
 from lidargrit.training.compute import duration, training_flops, uniform_images
 from lidargrit.training.stage import begin_training
 
@@ -47,7 +49,7 @@ def measure(preset: Preset) -> list[Measured]:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         flops = training_flops(preset)
-        generator = preset.build_generator()
+        generator, condition = preset.build_generator(), conditions.load(preset.data.condition)
         found = []
         for stage in flops:  # those that are trained
             config, objective = preset.settings_of(stage), generator.objective(stage)
@@ -61,7 +63,8 @@ def measure(preset: Preset) -> list[Measured]:
                 # for many steps, by the seed of a step, is prepared in the first.
                 new = replace(images, range_m=images.range_m * (1 - 1e-4 * step))
                 seed = 0 if prepared else step
-                float(engine.step(new, seed, config.gradient_clip, config.accumulate)["loss"])  # waits for a GPU
+                example = Example(new, condition.of(new))
+                float(engine.step(example, seed, config.gradient_clip, config.accumulate)["loss"])  # waits for a GPU
             per_s = _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun)
             seconds, device = config.scans / per_s, str(engine.device)
             seconds *= flops[stage] / (flops[stage] - prepared)  # preparing is as fast

@@ -12,9 +12,12 @@ from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import DatasetSource, PreparedSource, open_to_train
+from lidargrit.generation import conditions
+from lidargrit.generation.conditions import ToldOfScans
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
 from lidargrit.nn.precision import Precision
+from lidargrit.scans.condition import Nothing
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.stage import follow_settings
@@ -126,10 +129,12 @@ class CheckedStages:
     Args:
         objectives: objective of every stage, without values, by the name of the stage.
         donors: run from which a stage is taken as it is, by the name of the stage; the others are trained.
+        told: source of the condition that the generator is told of each scan.
     """
 
     objectives: Mapping[str, Objective]
     donors: Mapping[str, str]
+    told: ToldOfScans
 
     @property
     def trained(self) -> dict[str, Objective]:
@@ -146,6 +151,7 @@ class CheckedStages:
         for name, objective in self.trained.items():
             try:
                 objective.check(images.batch([0]))
+                self.told.of(images.batch([0]))
             except ConfigError as lacking:
                 why = f"{setting}, for the stage {name}: {lacking.got}"
                 raise ConfigError(why, lacking.wanted, lacking.cure) from None
@@ -169,7 +175,11 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
         objectives = {name: generator.objective(name) for name in generator.stages}
     donors = donors_of_stages(preset, generator.stages)
     taken_stages(preset, generator)
-    checked = CheckedStages(objectives, donors)
+    told = conditions.load(preset.data.condition)
+    if told.kind is not Nothing and told.kind not in generator.takes:
+        got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, which cannot be told it"
+        raise ConfigError(got, "a generator that takes it", "leave it out")
+    checked = CheckedStages(objectives, donors, told)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)
     return checked

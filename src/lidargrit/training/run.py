@@ -110,7 +110,9 @@ def _train(
                 objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = preset.data.workers, preset.settings_of(stage)
-            return StageTraining(objective, config, folder / stage, seed, reporter, built_on, workers, picture)
+            return StageTraining(
+                objective, config, folder / stage, seed, reporter, built_on, workers, checked.told, picture
+            )
 
         built_on = ""
         for number, stage in enumerate(generator.stages):

@@ -8,7 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -21,10 +21,12 @@ from lidargrit.core.reporting import Reporter
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import CHECKPOINT_FILE
+from lidargrit.generation.conditions import ToldOfScans
+from lidargrit.generation.conditions.nothing import NothingTold
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import prepare_for_training
-from lidargrit.scans.types import RangeImage
+from lidargrit.scans.example import Example
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.log import Log
@@ -46,6 +48,7 @@ class StageTraining:
         reporter: receiver of progress and messages.
         built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
         workers: number of threads that read ahead.
+        condition: source of what the generator is told of each scan.
         plot: function that plots the averaged objective into a file; None for no pictures.
         deadline_s: value of ``time.monotonic()`` at which training stops as it does by SIGTERM.
     """
@@ -57,6 +60,7 @@ class StageTraining:
     reporter: Reporter
     built_on: str = ""
     workers: int = 1
+    condition: ToldOfScans = field(default_factory=NothingTold)
     plot: Callable[[Objective, Path], None] | None = None
     deadline_s: float = math.inf
 
@@ -105,14 +109,15 @@ class StageTraining:
             self.engine.rank,
             self.engine.world_size,
             self.workers,
+            self.condition.of,
         )
         begun = time.monotonic()
         progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
         with Termination(self.deadline_s) as termination, progress_bar as progress:
             if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
                 self._log_terms("val", self.validate(val, termination), 0.0)
-            for images in batches.stream(self.scans_seen, config.scans):
-                terms = self._step(images)
+            for example in batches.stream(self.scans_seen, config.scans):
+                terms = self._step(example)
                 stops = self.engine.any(termination.asked)
                 progress.advance(
                     config.batch_size, f"loss {float(terms['loss']):.4f}  {self.engine.peak_gib():.1f} GiB"
@@ -148,20 +153,20 @@ class StageTraining:
             if termination is not None and self.engine.any(termination.asked):
                 raise Terminated
             indices = chosen[first : first + at_once]
-            terms = self.engine.evaluate(
-                self.average.objective, images.batch(indices), derive_seed(self.seed, 3, first)
-            )
+            batch = images.batch(indices)
+            example = Example(batch, self.condition.of(batch))
+            terms = self.engine.evaluate(self.average.objective, example, derive_seed(self.seed, 3, first))
             for name, value in terms.items():
                 totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)
         return totals
 
-    def _step(self, images: RangeImage) -> dict[str, Tensor]:
+    def _step(self, example: Example) -> dict[str, Tensor]:
         config = self.config
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate_at(config, self.scans_seen)
         seed = derive_seed(self.seed, 2, self.scans_seen, self.engine.rank)
         torch.manual_seed(derive_seed(seed, 0, 1))  # of dropout, which takes the global random numbers
-        terms = self.engine.step(images.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
+        terms = self.engine.step(example.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
         if not bool(terms["loss"].isfinite()):
             raise TrainingError(
                 f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",

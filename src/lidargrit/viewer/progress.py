@@ -9,6 +9,7 @@ import torch
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.generator import Generator
+from lidargrit.scans.condition import Nothing
 from lidargrit.viewer.pictures import plot_comparison
 
 _SCANS = 2  # a glance; more would take training's time
@@ -22,6 +23,6 @@ def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path
     if "encode" in generator.capabilities:
         groups["reconstructed"] = generator.reconstruct(real).to("cpu")
     samples = stage != generator.stages[0] or len(generator.stages) == 1
-    if samples and not generator.needs_condition:
+    if samples and Nothing in generator.takes:
         groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
     plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

@@ -25,6 +25,7 @@ class DataConfig:
         column_stride: step between the fine columns that an image keeps, such as 8 for every eighth.
         projection: ``spherical`` (rows by elevation), ``unfolding`` (rows by ring), or ``sensor`` for the sensor's own.
         projection_variant: ``exact``, or ``reference`` to repeat the projection of LidarGRIT's released program.
+        condition: name of what a generator is told of each training scan, from: lidargrit list conditions.
         max_scans: largest number of scans taken from each source, evenly spaced over it; 0 for all.
         bad_points: ``refuse`` a scan with points that are NaN, infinite or at the origin, or ``drop`` these points.
         bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` that scan with a message.
@@ -38,6 +39,7 @@ class DataConfig:
     column_stride: int = 1
     projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
     projection_variant: ProjectionVariant = "exact"
+    condition: str = "nothing"
     max_scans: int = 0
     bad_points: BadPoints = "refuse"
     bad_scans: Literal["refuse", "skip"] = "refuse"
@@ -91,7 +93,9 @@ class ScanSettings:
         """
         words = [*settings, *(f"data.{name}={value}" for name, value in options.items() if value not in (None, ""))]
         owner, cure = "reading scans", "name one with data. before it, as data.projection=spherical"
-        data = override(cls(), words, owner, cure, ("data.train", "data.val", "sensor", "projection_variant")).data
+        data = override(
+            cls(), words, owner, cure, ("data.train", "data.val", "data.condition", "sensor", "projection_variant")
+        ).data
         named = {word.partition("=")[0].strip() for word in words}
         variant = data.projection_variant if "data.projection_variant" in named else None
         return cls(data, data.sensor if "data.sensor" in named else "", variant)

@@ -20,7 +20,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_p
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage
 
@@ -228,7 +228,7 @@ class PixelDecoder(nn.Module):
         decoded: Decoded | None,
         rngs: Sequence[torch.Generator],
         sampling: PixelSampling | None = None,
-        condition: Condition | None = None,
+        condition: Observed | None = None,
     ) -> RangeImage:
         """Return one scan for each random generator; a scan does not depend on the others of its batch.
 
@@ -246,7 +246,7 @@ class PixelDecoder(nn.Module):
         for numbers, rng in zip(uniform, rngs, strict=True):
             numbers[0] = self.mask.noise(numbers[0], rng, shares)
         uniform = uniform.to(guide.v.device)
-        condition = (condition or Condition.nothing(self.sensor, len(rngs))).to(guide.v.device)
+        condition = (condition or Observed.nothing(self.sensor, len(rngs))).to(guide.v.device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if guide.v.device.type == "cpu" else len(uniform)
         images = []
@@ -265,7 +265,7 @@ class PixelDecoder(nn.Module):
         guide: Guide,
         uniform: Float[Tensor, "B 2 H W"],
         mask: Bool[Tensor, "B H W"],
-        condition: Condition,
+        condition: Observed,
         sampling: PixelSampling,
     ) -> Float[Tensor, "B H W"]:
         """Return the ranges of a whole mask, sampled phase by phase around the observed ones."""

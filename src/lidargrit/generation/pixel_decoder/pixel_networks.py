@@ -29,7 +29,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
 from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.nn.precision import at_least_32_bits
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
 
@@ -248,7 +248,7 @@ class MaskNetwork(PhaseNetwork):
         numbers = [self.noise(torch.rand(size, generator=rng), rng, shares) for rng in rngs]
         return torch.stack(numbers).to(self.row_bias.device)
 
-    def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Condition) -> Bool[Tensor, "B H W"]:
+    def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.
 
         Args:

@@ -25,6 +25,7 @@ from lidargrit.nn.blocks import Block
 from lidargrit.nn.convolution import Convolution, Downsample, ResidualBlock, group_norm
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.quantiser import CodebookLoss
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 
@@ -224,8 +225,9 @@ class CurveVqvae(ConvolutionalTokenizer[CurveVqvaeConfig]):
         latents = (1, self.config.code_dim, *self.grid_size)
         return flops_of(self.post_quant_conv, latents) + flops_of(self.decoder, latents)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss and its terms, the range error in metres, and the mask's accuracy."""
+        images = example.images
         z = self.quantize(self.latents(images), rng)
         raw = self.decoder(self.post_quant_conv(z.latents)).float()
         encoded = encode_range(images.range_m, self.config)

@@ -36,6 +36,7 @@ from lidargrit.nn.convolution import (
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision, at_least_32_bits, dtype_of
 from lidargrit.nn.quantiser import CodebookLoss
+from lidargrit.scans.example import Example
 from lidargrit.scans.projection import RangeEncoding
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
@@ -266,8 +267,9 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         if self.config.reflectance:
             required_reflectance(images.reflectance, _SETTING)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss of eq. 5 of the paper and its terms, the range error in metres, and the mask's accuracy."""
+        images = example.images
         z = self.quantize(self.latents(images), rng)
         encoded, return_logits, reflectance = self._heads(self.decoder(self.post_quant_conv(z.latents)))
         mask, encoding = images.return_mask, self.range_encoding

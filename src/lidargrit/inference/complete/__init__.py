@@ -15,7 +15,7 @@ from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant,
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.condition import KINDS, Condition, ConditionKind
+from lidargrit.scans.condition import KINDS, ConditionKind, Observed
 from lidargrit.scans.fills import FILLS
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel
@@ -50,7 +50,7 @@ class Model:
         """Variant by which scans become range images."""
         return "exact" if self.folder is None else projection_variant(self.folder)
 
-    def complete(self, condition: Condition, seeds: Sequence[int]) -> RangeImage:
+    def complete(self, condition: Observed, seeds: Sequence[int]) -> RangeImage:
         """Return scans that keep what was observed, one for each seed, in the computer's memory."""
         return self.generator.complete(condition, seeds, self.sampling).to("cpu")
 

@@ -11,7 +11,7 @@ from lidargrit.inference.complete.files import OutputConfig, write_completions
 from lidargrit.inference.complete.inputs import InputScan, ScanReader, open_inputs
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.inference.complete.sparse import SparseReader, observed_rows
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -45,9 +45,9 @@ def complete_scans(
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
 
-    def condition_of(scan: InputScan, seed: int) -> Condition:
+    def condition_of(scan: InputScan, seed: int) -> Observed:
         source = "a range image" if scan.points is None else scan.points.source
-        return Condition.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed, source)[None])
+        return Observed.of_pixels(_batch(scan.image), pattern.mask(scan.image, seed, source)[None])
 
     inputs = open_inputs(source, _reader(model, pattern.partial), config, reporter)
     facts = {"verb": "complete", "source": source, **pattern.identity()}
@@ -75,8 +75,8 @@ def upsample_scans(
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
 
-    def condition_of(scan: InputScan, seed: int) -> Condition:
-        return Condition.of_pixels(_batch(scan.image), observed_rows(scan)[None])
+    def condition_of(scan: InputScan, seed: int) -> Observed:
+        return Observed.of_pixels(_batch(scan.image), observed_rows(scan)[None])
 
     reader = SparseReader(model.sensor, model.projection_variant, source=scans_sensor)
     inputs = open_inputs(source, reader, config, reporter)
@@ -100,8 +100,8 @@ def raydrop_scans(
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
 
-    def condition_of(scan: InputScan, seed: int) -> Condition:
-        return Condition.of_surfaces(_batch(scan.image))
+    def condition_of(scan: InputScan, seed: int) -> Observed:
+        return Observed.of_surfaces(_batch(scan.image))
 
     inputs = open_inputs(source, _reader(model, partial=False), config, reporter)
     facts = {"verb": "raydrop", "source": source}

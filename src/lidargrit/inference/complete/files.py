@@ -33,7 +33,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.image_files import PROBABILITY
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.inputs import Inputs, InputScan
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -73,7 +73,7 @@ class _Job:
     number: int
     turn: int
     scan: InputScan
-    condition: Condition
+    condition: Observed
     form: type[ScanFormat] | None
 
 
@@ -81,7 +81,7 @@ def write_completions(
     inputs: Inputs,
     out: Path,
     model: Model,
-    condition_of: Callable[[InputScan, int], Condition],
+    condition_of: Callable[[InputScan, int], Observed],
     output: OutputConfig,
     facts: dict[str, Any],
     config: DataConfig,
@@ -174,7 +174,7 @@ def _files(inputs: Inputs, source: str, output: OutputConfig, sensor: SensorMode
 def _jobs(
     inputs: Inputs,
     missing: Sequence[tuple[int, int]],
-    condition_of: Callable[[InputScan, int], Condition],
+    condition_of: Callable[[InputScan, int], Observed],
     seed: int,
     skipped: set[int] | None,
     reporter: Reporter,
@@ -205,7 +205,7 @@ def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
 
 
 def _completed(model: Model, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
-    condition = Condition.cat([job.condition for job in jobs])
+    condition = Observed.cat([job.condition for job in jobs])
     images = model.complete(condition, [_seed(seed, job) for job in jobs])
     return [images[index] for index in range(len(jobs))]
 
@@ -215,7 +215,7 @@ def _return_share(model: Model, job: _Job, output: OutputConfig) -> Float[Tensor
     total = torch.zeros(job.condition.return_mask.shape[1:])
     remaining = iter(range(output.probability))
     while turns := list(islice(remaining, model.generator.compute_batch)):
-        condition = Condition.cat([job.condition] * len(turns))
+        condition = Observed.cat([job.condition] * len(turns))
         seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += model.complete(condition, seeds).return_mask.float().sum(0)
     return total / output.probability

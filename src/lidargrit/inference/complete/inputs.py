@@ -21,7 +21,7 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
@@ -40,6 +40,7 @@ class InputScan:
         point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
         on_grid: True for pixels that the scan covers; None for all.
         doubt: sign that another sensor than the named one made the scan, for a person; "" if there is none.
+        method: projection by which the points became the image.
     """
 
     image: RangeImage
@@ -47,8 +48,9 @@ class InputScan:
     point_of_pixel: Int64[Tensor, "H W"] | None = None
     on_grid: Bool[Tensor, "H W"] | None = None
     doubt: str = ""
+    method: ProjectionName = "spherical"
 
-    def joined(self, completed: RangeImage, condition: Condition) -> Scan:
+    def joined(self, completed: RangeImage, condition: Observed) -> Scan:
         """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
         rays.
 
@@ -181,7 +183,7 @@ class ScanReader:
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         doubt = doubts_about_rays(scan, self.sensor, method)
         said = told_doubt(scan.source, self.sensor, doubt)
-        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
+        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said, method=method)
 
 
 def images_for(models: Sequence[Model], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, Shaped
 from scipy.ndimage import uniform_filter1d
 from torch import Tensor
 
-from lidargrit.scans.condition import Condition
-from lidargrit.scans.fills import Observed, linear
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.fills import SeenScan, linear
 from lidargrit.scans.types import TYPICAL_LOG_RANGE
 
 NUM_MAPS, NUM_CANDIDATES, NUM_LABELS, NUM_REFLECTANCES = 19, 9, 5, 6
@@ -58,9 +58,9 @@ class Hints(NamedTuple):
         return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels, bright)
 
 
-def hints_of(condition: Condition) -> Hints:
+def hints_of(condition: Observed) -> Hints:
     """Return the hints of a batch of scans, on the device of the condition."""
-    every = [Observed.of(condition, index) for index in range(len(condition))]
+    every = [SeenScan.of(condition, index) for index in range(len(condition))]
     next_returns = [[_next_return(seen, *side) for side in _SIDES] for seen in every]
     both = [_of_one(seen, nexts) for seen, nexts in zip(every, next_returns, strict=True)]
     maps, candidates = (torch.from_numpy(np.stack(part)).to(condition.range_m) for part in zip(*both, strict=True))
@@ -92,7 +92,7 @@ class _NextReturn(NamedTuple):
 
 
 def _of_one(
-    seen: Observed, next_returns: Sequence[_NextReturn]
+    seen: SeenScan, next_returns: Sequence[_NextReturn]
 ) -> tuple[Float32[np.ndarray, "19 H W"], Float32[np.ndarray, "9 H W"]]:
     if not seen.returned.any():
         empty = np.zeros((NUM_MAPS, *seen.returned.shape), dtype=np.float32)
@@ -128,7 +128,7 @@ def _share_around(part: Bool[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
 
 
 def _at_returns(
-    pixels: Shaped[np.ndarray, "H W"], seen: Observed, next_returns: Sequence[_NextReturn]
+    pixels: Shaped[np.ndarray, "H W"], seen: SeenScan, next_returns: Sequence[_NextReturn]
 ) -> Shaped[np.ndarray, "5 H W"]:
     """Return what pixels hold at the nearest return and at those on every side; at the nearest where there is none.
 
@@ -140,7 +140,7 @@ def _at_returns(
     return np.stack([nearest, *(np.where(at < 0, nearest, pixels.ravel()[at]) for at, _ in next_returns)])
 
 
-def _next_return(seen: Observed, down: int, right: int) -> _NextReturn:
+def _next_return(seen: SeenScan, down: int, right: int) -> _NextReturn:
     """Return the next observed return on one side of every pixel, not the pixel itself; columns wrap around."""
     lines = np.tile(seen.range_m, (1, 3)) if right else seen.range_m.T
     backwards = down + right < 0

@@ -16,7 +16,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.hints import (
@@ -178,7 +178,7 @@ class CompletionNetwork(nn.Module):
         apart = (candidates - v.detach()[:, None]).abs()
         return (4 * trust + self.preferred[: trust.shape[1]] - apart / _ONE_SURFACE).softmax(1)
 
-    def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
+    def sample(self, condition: Observed, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return completed scans: the range estimated, the mask sampled; a scan does not depend on the others.
 
         The range is the mean of two estimates, of the scan and of its mirror image, and so are the reflectance and the

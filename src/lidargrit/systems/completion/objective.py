@@ -13,7 +13,8 @@ from torch import Tensor
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, reflectance_error, required_reflectance
 from lidargrit.generation.semantic_classes import class_indices, labels_to_learn
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.hints import hints_of
@@ -55,7 +56,7 @@ class CompletionObjective(Objective):
         if self.completion.config.reflectance:
             required_reflectance(images.reflectance, _SETTING)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss, and beside it the error in metres of hidden returns and the bits of a hidden return.
 
         A network with classes is told those of observed pixels in three of four scans; beside the loss then stands the
@@ -65,8 +66,9 @@ class CompletionObjective(Objective):
         Raises:
             ConfigError: a network with classes and scans without labels, or one with reflectance and scans without it.
         """
+        images = example.images
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
-        condition, learned = Condition.of_pixels(images, observed), self.completion.config
+        condition, learned = Observed.of_pixels(images, observed), self.completion.config
         label, reflectance = None, None  # no hints are computed of what the network does not see
         if learned.labels:
             label = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)

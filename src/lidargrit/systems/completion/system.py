@@ -12,7 +12,7 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.random import rngs_of
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
@@ -43,7 +43,6 @@ class Completion(Generator[CompletionConfig, NoSampling]):
         first_command="complete SCANS completed --observed rows:4 --model RUN",
     )
     capabilities = frozenset({"complete"})
-    needs_condition = True
 
     def __init__(self, config: CompletionConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -68,12 +67,17 @@ class Completion(Generator[CompletionConfig, NoSampling]):
         """Take over the trained weights."""
         self.completion.load_state_dict(objective.get_submodule(stage).state_dict())
 
-    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    @property
+    def takes(self) -> frozenset[type[Condition]]:
+        """Observations alone: it has no new scans to sample."""
+        return frozenset({Observed})
+
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
         return self.completion.sample(condition, rngs_of(seeds))
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:
         """Return the cost of two estimates of the range and all phases of the mask, counted while it is computed."""
-        nothing = Condition.nothing(self.sensor, 1).to(self.device)
+        nothing = Observed.nothing(self.sensor, 1).to(self.device)
         with torch.no_grad(), FlopCounter() as counter:
             self.completion.sample(nothing, [torch.Generator()])
         return Cost(2 + len(self.completion.mask.phases), counter.total)

@@ -25,7 +25,8 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import normal_latents, rngs_of
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.projection import RangeEncoding
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import MaskDecoding, RangeImage
@@ -168,7 +169,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         assert isinstance(objective, AdversarialObjective)
         self.synthesis.load_state_dict(objective.synthesis.state_dict())
 
-    def _sample(self, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: DustySampling) -> RangeImage:
         return self._generate(self._latents(seeds), seeds, sampling)
 
     def cost(self, sampling: DustySampling | None = None) -> Cost:
@@ -183,7 +184,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         return self._generate(self._search(images, images.return_mask, seeds, sampling), seeds, sampling)
 
-    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         """Return the nearest scans that the network generates, by the observed returns alone."""
         latents = self._search(condition.images, condition.images.return_mask, seeds, sampling)
         return self._generate(latents, seeds, sampling)
@@ -261,8 +262,9 @@ class AdversarialObjective(Objective):
         self.synthesis, self.discriminator = synthesis, Discriminator(_widths(config), _size(sensor))
         self.register_buffer("turns", torch.zeros((), dtype=torch.int64))  # of the discriminator
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return a player's loss; the other one's weights are out of its reach."""
+        images = example.images
         if player == "discriminator":
             with torch.no_grad():
                 generated, _ = self._generate_encoded(len(images), rng)

@@ -8,7 +8,7 @@ from typing import Literal
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -35,7 +35,6 @@ class Interpolation(Generator[InterpolationConfig, NoSampling]):
         first_command="complete SCANS completed --observed rows:4 --model RUN",
     )
     capabilities = frozenset({"complete"})
-    needs_condition = True
     is_random = False
 
     @classmethod
@@ -43,7 +42,12 @@ class Interpolation(Generator[InterpolationConfig, NoSampling]):
         """Return the settings themselves."""
         return InterpolationConfig()
 
-    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    @property
+    def takes(self) -> frozenset[type[Condition]]:
+        """Observations alone: it has no new scans to sample."""
+        return frozenset({Observed})
+
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
         return fill(self.config.method, condition).to(self.device)
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:

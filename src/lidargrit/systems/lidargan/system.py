@@ -21,6 +21,8 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import normal_latents
 from lidargrit.nn.size import numbers_of_file
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargan.filled_rows import FilledRows
@@ -121,7 +123,7 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         self.image.load_state_dict(objective.image.state_dict())
         self.decoder.load_state_dict(objective.decoder.state_dict())
 
-    def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
         latents = normal_latents(seeds, self.config.latent_dim).to(self.device)
         return self.image.decode(self.decoder(latents))
 
@@ -178,8 +180,9 @@ class LidarGanObjective(Objective):
         size = (config.rows, image.sensor.width)
         self.discriminator = Encoder(1, config.channels, size, config.initial_std)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return a player's loss, and the discriminator's mean output for real and generated images."""
+        images = example.images
         real = self.image.encode(images)
         latents = torch.randn(len(real), self.config.latent_dim, generator=rng, device=rng.device)
         if player == "discriminator":

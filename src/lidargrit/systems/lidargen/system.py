@@ -22,7 +22,8 @@ from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.random import SeededNoise
 from lidargrit.nn.size import numbers_of_file
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargen.lidargen_checkpoint import read_lidargen_checkpoint
@@ -171,12 +172,12 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         assert isinstance(objective, ScoreMatching)
         self.network.load_state_dict(objective.network.state_dict())
 
-    def _sample(self, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: LangevinSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.shape, self.device)
         images = langevin(self.network, noise.uniform(), noise, *self._schedule(sampling))
         return self._decoded(images, sampling)
 
-    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: Sequence[int], sampling: LangevinSampling) -> RangeImage:
         """Generate scans that agree with the observed pixels, as the paper densifies sparse scans."""
         noise = SeededNoise(seeds, self.shape, self.device)
         observed, images = condition.return_observed[:, None], condition.images
@@ -260,8 +261,9 @@ class ScoreMatching(Objective):
         """Refuse images without the reflectance that is to be learned."""
         encode(images, self.config)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error, summed over the values of an image, as ``loss``, and that of one value beside it."""
+        images = example.images
         clean = encode(images, self.config)
         level = torch.randint(len(self.sigmas), (len(clean),), generator=rng, device=clean.device)
         noise = torch.randn(clean.shape, generator=rng, device=clean.device)

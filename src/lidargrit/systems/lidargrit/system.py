@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,8 @@ from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import rngs_of, sample_index
 from lidargrit.nn.transformer import CausalTransformer
-from lidargrit.scans.condition import Condition, ConditionKind
+from lidargrit.scans.condition import Condition, ConditionKind, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, TokenGrid
 
@@ -157,7 +158,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         """Number of scans whose tokens are sampled at once; a step for several takes little longer than for one."""
         return 8 if self.device.type == "cpu" else 32
 
-    def _sample(self, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: TokenSampling) -> RangeImage:
         return self._by_tokens(None, rngs_of(seeds), seeds.num_asked_for, sampling)
 
     @property
@@ -165,11 +166,11 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         """Observed pixels, and ranges of surfaces whose returns are sampled."""
         return frozenset({"pixels", "surfaces"})
 
-    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
         return self._by_tokens(condition, rngs_of(seeds), seeds.num_asked_for, sampling)
 
     def _by_tokens(
-        self, condition: Condition | None, rngs: list[torch.Generator], count: int, sampling: TokenSampling
+        self, condition: Observed | None, rngs: list[torch.Generator], count: int, sampling: TokenSampling
     ) -> RangeImage:
         """Generate the tokens without any observed pixel, and with a pixel decoder the pixels around observed ones.
 
@@ -214,17 +215,19 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     @torch.no_grad()
     def _prepare(self, batch_size: int, sampling: TokenSampling) -> tuple[CachedDecoder, Tokenizer]:
         """Return what generates tokens and what decodes them, kept from the last call if nothing has changed since."""
-        weights = tuple((each.data_ptr(), -1 if each.is_inference() else each._version) for each in self.parameters())
+        weights = self.state_dict()
+        places = tuple((each.data_ptr(), each.device) for each in weights.values())
         guidance = self._guidance(sampling)
         choices = (sampling.temperature, sampling.top_k, sampling.top_p, guidance, sampling.weights, sampling.decoder)
-        key = (batch_size, choices, weights)
-        if self._prepared is None or self._prepared.key != key:
+        key = (batch_size, choices, places)
+        if self._prepared is None or not self._prepared.serves(key, weights):
             self._prepared = None  # its cache is given back before the next is taken
             by_choices = partial(sample_token, sampling=sampling)
             decoder = CachedDecoder(
                 self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights, guidance=guidance
             )
-            self._prepared = _Prepared(key, decoder, self.tokenizer.for_decoding(sampling.decoder))
+            copies = {name: each.clone() for name, each in weights.items()}
+            self._prepared = _Prepared(key, copies, decoder, self.tokenizer.for_decoding(sampling.decoder))
         return self._prepared.decoder, self._prepared.tokenizer
 
     def __getstate__(self) -> dict[str, object]:
@@ -257,15 +260,21 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
 class _Prepared(NamedTuple):
     key: object
+    weights: Mapping[str, Tensor]
     decoder: CachedDecoder
     tokenizer: Tokenizer
+
+    def serves(self, key: object, weights: Mapping[str, Tensor]) -> bool:
+        """Return whether it was made of these very weights: neither their addresses nor torch's versions tell that."""
+        return self.key == key and all(torch.equal(each, self.weights[name]) for name, each in weights.items())
 
 
 class NextToken(TokenObjective):
     """The transformer's objective: negative log-likelihood of each token after those before it, in nats per token."""
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
+        images = example.images
         tokens, unigram_nll = self.encode(images)
         logits = self.transformer(after_start(tokens[:, :-1]))
         loss = F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten())

@@ -25,7 +25,8 @@ from lidargrit.nn.processes import num_processes
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import normal_latents
 from lidargrit.nn.size import numbers_of_file
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargan.filled_rows import FilledRows
@@ -163,7 +164,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         self.encode.load_state_dict(objective.encode.state_dict())
         self.decode.load_state_dict(objective.decode.state_dict())
 
-    def _sample(self, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: VaeSampling) -> RangeImage:
         return self.image.decode(self.decode(self._latents(seeds)))
 
     def cost(self, sampling: VaeSampling | None = None) -> Cost:
@@ -174,7 +175,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         mean, _ = self.encode(self.image.encode(images)).chunk(2, dim=1)
         return self.image.decode(self.decode(mean))
 
-    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
         mean, log_variance = self.encode(self.image.encode(condition.images)).chunk(2, dim=1)
         latents = mean + sampling.spread * (log_variance / 2).exp() * self._latents(seeds)
         return self.image.decode(self.decode(latents))
@@ -241,8 +242,9 @@ class LidarVaeObjective(Objective):
         self.config, self.encode, self.decode, self.image = config, encode, decode, image
         self.register_buffer("scans_seen", torch.zeros((), dtype=torch.int64))
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss and its two parts."""
+        images = example.images
         real = self.image.encode(images)
         mean, log_variance = self.encode(real).chunk(2, dim=1)
         latents = mean

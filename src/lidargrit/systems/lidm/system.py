@@ -23,6 +23,8 @@ from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.published import read_checkpoint, weights_below
 from lidargrit.nn.random import SeededNoise
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import MaskDecoding, RangeImage
 from lidargrit.systems.lidm import latent_diffusion
@@ -160,7 +162,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         """Return what the tokens keep of a batch of scans, the mask by threshold."""
         return self.tokenizer.reconstruct(images)
 
-    def _sample(self, seeds: Sequence[int], sampling: LidmSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: LidmSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.latent_shape, self.device)
         latents = latent_diffusion.ddim(self.denoiser, noise, self._shares(), sampling.steps, sampling.eta)
         latents = latents * self.latent_scale if self.axes is None else self.axes.latents(latents)
@@ -226,8 +228,9 @@ class LatentDenoising(Objective):
         self._shares, self.axes = shares, axes
         self.register_buffer("latent_scale", latent_scale.clone())
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the mean squared error as ``loss``, and the standard deviation of the scaled latents beside it."""
+        images = example.images
         latents = self._latents(images)
         clean = latents / self.latent_scale if self.axes is None else self.axes(latents)
         step = torch.randint(latent_diffusion.TIME_STEPS, (len(clean),), generator=rng, device=clean.device)

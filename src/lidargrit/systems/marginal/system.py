@@ -16,6 +16,7 @@ from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.nn.random import rngs_of
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -104,7 +105,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         """Number of scans that are sampled at once; the histograms are summed up once for all of them."""
         return _BATCH
 
-    def _sample(self, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: NoSampling) -> RangeImage:
         """Sample every pixel by itself.
 
         Raises:

@@ -22,6 +22,8 @@ from lidargrit.generation.tokens import PixelChoice, TokenGenerator, TokenGenera
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.random import gumbel_of, rngs_of, sample_index
 from lidargrit.nn.transformer import MaskedTransformer
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -117,7 +119,7 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         """Return 4 passes."""
         return MaskedSampling(steps=4)
 
-    def _sample(self, seeds: BatchSeeds, sampling: MaskedSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: MaskedSampling) -> RangeImage:
         self.check_choice(sampling.mask, sampling.pixels())
         rngs = rngs_of(seeds)
         tokens = generate_tokens(self.transformer, rngs, sampling)
@@ -142,8 +144,9 @@ class HiddenTokens(TokenObjective):
 
     transformer: MaskedTransformer
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the paper's eq. 1 per hidden token, and the same of a model that knows only token frequencies."""
+        images = example.images
         tokens, unigram_nll = self.encode(images)
         count, length = tokens.shape
         # Each scan's progress is uniform in [0, 1); within a batch they are evenly spread, which calms the loss.

@@ -15,6 +15,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.nn.exact_weights import load_exactly
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -82,7 +83,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
             raise CheckpointError(got, "as many as it counts", "restore the file, or train again")
         return generator.eval()
 
-    def _sample(self, seeds: Sequence[int], sampling: NoSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
         """Return the scan of each seed: as many seeds in a row as there are scans give each of them once.
 
         Raises:

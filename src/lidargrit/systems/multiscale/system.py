@@ -13,7 +13,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokens import PixelObjective
 from lidargrit.nn.random import rngs_of
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, ScanBits
 
@@ -65,11 +65,11 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
         """Take over the trained weights."""
         self.pixels.load_state_dict(objective.get_submodule(stage).state_dict())
 
-    def _sample(self, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
         rngs = rngs_of(seeds)
         return self.pixels.sample(None, rngs, sampling)
 
-    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
         rngs = rngs_of(seeds)
         return self.pixels.sample(None, rngs, sampling, condition)
 

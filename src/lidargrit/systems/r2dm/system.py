@@ -24,7 +24,8 @@ from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.random import SeededNoise
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Condition, Observed
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2dm import diffusion
@@ -167,11 +168,11 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         dropped = min(round((1 - float(self.return_share)) * len(levels)), len(levels) - 1)
         self.return_threshold.fill_(float(levels[dropped]))
 
-    def _sample(self, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: DiffusionSampling) -> RangeImage:
         self._check(sampling)
         return self._decoded(self._sample_values(seeds, sampling), sampling)
 
-    def _complete(self, condition: Condition, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: Sequence[int], sampling: DiffusionSampling) -> RangeImage:
         """Generate scans that agree with the observed pixels, by RePaint over DDPM."""
         self._check(sampling)
         if sampling.sampler != "ddpm":
@@ -223,8 +224,9 @@ class Denoising(Objective):
         """Refuse images without the reflectance that is to be learned."""
         encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the weighed error as ``loss``, and the plain one beside it."""
+        images = example.images
         clean = encode(images, with_reflectance=self.network.out_conv.out_channels > 1)
         time = torch.rand(len(clean), generator=rng, device=clean.device, dtype=torch.float64)
         noise = torch.randn(clean.shape, generator=rng, device=clean.device)

@@ -21,6 +21,7 @@ from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.random import SeededNoise
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2flow import flow
@@ -135,8 +136,9 @@ class FlowMatching(Objective):
         """Refuse images without the reflectance that is to be learned."""
         encode(images, with_reflectance=self.network.images > 1)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the mean squared error as ``loss``."""
+        images = example.images
         clean = encode(images, with_reflectance=self.network.images > 1)
         time = torch.rand(len(clean), generator=rng, device=clean.device)
         noise = torch.randn(clean.shape, generator=rng, device=clean.device)
@@ -169,8 +171,9 @@ class PairMatching(Objective):
         self.settings = ("reflow.distilled_steps", "reflow.distilled_pairs") if distilled_steps else ()
         self._pairs = FlowPairs(network, sensor, solving)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the pseudo-Huber error as ``loss``, and beside it the squared error."""
+        images = example.images
         first, count = (0, self._count) if self.training else (self._count, _HELD_OUT_PAIRS)
         chosen = first + torch.randint(count, (len(images),), generator=rng, device=rng.device)
         noise, clean = self._pairs(chosen)

@@ -16,6 +16,7 @@ from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.random import SeededNoise
 from lidargrit.nn.size import numbers_of_file
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel, continuous_azimuths_rad
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2flow import flow
@@ -106,7 +107,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         assert isinstance(objective, FlowMatching | PairMatching)
         self.network.load_state_dict(objective.network.state_dict())
 
-    def _sample(self, seeds: Sequence[int], sampling: FlowSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: FlowSampling) -> RangeImage:
         return decode(self._solved(seeds, sampling).images, self.sensor)
 
     @torch.no_grad()

@@ -16,7 +16,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
 
@@ -137,7 +137,7 @@ class RaydropNetwork(nn.Module):
             reflectance = TYPICAL_REFLECTANCE + of_parts["reflectance"].float()[:, 0]
         return Returns(Guide(features, v, logits.detach(), ~surface), logits, reflectance)
 
-    def sample(self, condition: Condition, rngs: Sequence[torch.Generator]) -> RangeImage:
+    def sample(self, condition: Observed, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return the surfaces that return, of each scan by its own random numbers; ranges stay as they are.
 
         Reflectance is a point estimate, which depends on no random number.

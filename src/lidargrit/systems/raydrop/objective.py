@@ -14,6 +14,7 @@ from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import reflectance_error, required_reflectance
 from lidargrit.generation.semantic_classes import labels_to_learn
 from lidargrit.scans import marks
+from lidargrit.scans.example import Example
 from lidargrit.scans.fills import ranges_from_others
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -49,13 +50,14 @@ class RaydropObjective(Objective):
         if self.raydrop.config.reflectance:
             required_reflectance(reflectance, _SETTING)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss, and beside it the bits of a surface's return, and the mean absolute error of reflectance.
 
         Raises:
             ConfigError: scans whose surfaces are not marked, unless surfaces are to be estimated; or scans without
                 labels, for a network with classes, or without reflectance, for a network with it.
         """
+        images = example.images
         if self.needs_marks:
             surfaces, (returned, reflectance) = images, self._marked(images)
         else:

@@ -13,7 +13,7 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.random import rngs_of
-from lidargrit.scans.condition import Condition, ConditionKind
+from lidargrit.scans.condition import Condition, ConditionKind, Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
@@ -43,7 +43,6 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
         first_command="raydrop SCANS dropped --model RUN",
     )
     capabilities = frozenset({"complete"})
-    needs_condition = True
 
     def __init__(self, config: RaydropConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -73,7 +72,12 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
         """Take over the trained weights."""
         self.raydrop.load_state_dict(objective.get_submodule(stage).state_dict())
 
-    def _complete(self, condition: Condition, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    @property
+    def takes(self) -> frozenset[type[Condition]]:
+        """Observations alone: it has no new scans to sample."""
+        return frozenset({Observed})
+
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
         if not bool((condition.range_observed | condition.return_observed).all()):
             raise ConfigError(
                 "scans with rays of which nothing is known",
@@ -87,5 +91,5 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
         range_m = torch.full((1, self.sensor.height, self.sensor.width), self.sensor.range_max_m)
         clean = RangeImage(range_m, range_m > 0, self.sensor).to(self.device)
         with torch.no_grad(), FlopCounter() as counter:
-            self.raydrop.sample(Condition.of_surfaces(clean), [torch.Generator()])
+            self.raydrop.sample(Observed.of_surfaces(clean), [torch.Generator()])
         return Cost(1 + len(self.raydrop.mask.phases), counter.total)

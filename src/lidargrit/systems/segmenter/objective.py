@@ -10,6 +10,7 @@ from torch import Tensor
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import required_reflectance
 from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, labels_to_learn
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.segmenter.network import SegmenterNetwork
@@ -39,13 +40,14 @@ class SegmenterObjective(Objective):
         if self.segmenter.config.reflectance:
             required_reflectance(images.reflectance, _SETTING)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss, and beside it the share of returns whose class it finds, and the mean over classes of the
         intersection over the union.
 
         Raises:
             ConfigError: scans without labels, or without reflectance for a network that sees it.
         """
+        images = example.images
         range_m, reflectance = images.range_m, None
         if self.segmenter.config.reflectance:
             reflectance = required_reflectance(images.reflectance, _SETTING)

@@ -6,10 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import torch
 
+from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import FlopCounter
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.segmenter.network import SegmenterNetwork, SegmenterNetworkConfig
@@ -35,8 +37,6 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
         generates="a label for every return of a scan; no scans",
         first_command="segment SCANS labelled --model RUN",
     )
-    capabilities = frozenset({"segment"})
-    needs_condition = True
     is_random = False
 
     def __init__(self, config: SegmenterConfig, sensor: SensorModel) -> None:
@@ -47,6 +47,11 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
     def smallest_config(cls, sensor: SensorModel) -> SegmenterConfig:
         """Return a network of eight channels and one block."""
         return SegmenterConfig(SegmenterNetworkConfig((8, 8, 8), blocks=1, attention_layers=0, heads=1))
+
+    @property
+    def takes(self) -> frozenset[type[Condition]]:
+        """No condition at all: it has no scans to sample."""
+        return frozenset()
 
     @property
     def stages(self) -> tuple[str, ...]:
@@ -61,8 +66,20 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
         """Take over the trained weights."""
         self.segmenter.load_state_dict(objective.get_submodule(stage).state_dict())
 
-    def _segment(self, images: RangeImage) -> RangeImage:
-        return replace(images, label=self.segmenter.classes(images))
+    @torch.no_grad()
+    def segment(self, images: RangeImage) -> RangeImage:
+        """Return scans with the likeliest class of each return as its label, each scan computed by itself.
+
+        Args:
+            images: batch of range images (B, H, W); labels that they have are not read.
+
+        Raises:
+            ConfigError: images of other rays, or no batch.
+        """
+        check_images(images, self.sensor)
+        self.eval()
+        found = [self.segmenter.classes(image) for image in one_by_one(images.to(self.device))]
+        return replace(images, label=torch.cat(found).to(images.range_m.device))
 
     def cost(self, sampling: NoSampling | None = None) -> Cost:
         """Return the cost of labelling one scan, counted while it is computed."""

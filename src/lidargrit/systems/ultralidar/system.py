@@ -21,6 +21,8 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.random import gumbel_of, sample_index
 from lidargrit.nn.size import numbers_of_file
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.ultralidar.codebook_care import CodebookCare
@@ -153,7 +155,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         self.eval()
         return torch.cat([self._voxels(int(seed), settings) for seed in seeds])
 
-    def _sample(self, seeds: Sequence[int], sampling: VoxelSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: VoxelSampling) -> RangeImage:
         occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds])
         return self._images(occupied, sampling.points)
 
@@ -232,8 +234,9 @@ class VoxelReconstruction(Objective):
         self.autoencoder, self._flips = autoencoder, flips
         self.care = CodebookCare(autoencoder.config.num_codes, autoencoder.config.code_dim)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return 100 times a voxel's error and 10 times its code's as ``loss``; beside it both, and the IoU."""
+        images = example.images
         voxels = _training_voxels(images, self.autoencoder.config.grid, self._flips, rng)
         quantised, latents = self.autoencoder.quantise(voxels)
         logits = self.autoencoder.decoder(quantised.latents.flatten(2).transpose(1, 2))
@@ -264,8 +267,9 @@ class HiddenVoxelTokens(Objective):
         self.prior, self._flips = prior, flips
         self._frozen = Frozen(autoencoder)
 
-    def forward(self, images: RangeImage, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the error in nats for each hidden token, of which a batch hides one share, and how many are right."""
+        images = example.images
         autoencoder = self._frozen.network(images.range_m.device)
         voxels = _training_voxels(images, autoencoder.config.grid, self._flips, rng)
         with torch.no_grad(), without_autocast(voxels.device):  # tokens as outside of training

@@ -31,7 +31,7 @@ from lidargrit.inference.complete.inputs import InputScan, ScanReader
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.inference.complete.sparse import SparseReader, observed_rows
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.condition import Condition
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count
 from lidargrit.scans.sensors import load_sensor
@@ -139,7 +139,7 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     seeds = range(request.seed, request.seed + request.count)
     if not request.file:
         names = tuple(f"seed {seed}" for seed in seeds)
-        return [ScanSet("generated", generator.sample(seeds, sampling).to("cpu"), names)]
+        return [ScanSet("generated", generator.sample(seeds, sampling=sampling).to("cpu"), names)]
     seen = _read_upload(request, generator, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
     sets = [ScanSet("as uploaded", image, (request.name,))]
@@ -150,10 +150,10 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     names = tuple(f"{request.name}, seed {seed}" for seed in seeds)
     images = RangeImage.stack([image[0]] * request.count)
     if request.task == "raydrop":
-        dropped = generator.complete(Condition.of_surfaces(images), seeds, sampling)
+        dropped = generator.complete(Observed.of_surfaces(images), seeds, sampling)
         return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names)]
     observed = _observed(request, seen)
-    condition = Condition.of_pixels(images, observed.expand_as(images.return_mask))
+    condition = Observed.of_pixels(images, observed.expand_as(images.return_mask))
     if bool((images[0].return_mask & ~observed).any()):
         sets.append(ScanSet("what the model saw", condition[0:1].images, (request.name,)))
     return [*sets, ScanSet("completed", generator.complete(condition, seeds, sampling).to("cpu"), names)]

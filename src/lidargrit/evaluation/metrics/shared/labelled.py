@@ -14,11 +14,11 @@ from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import PACKAGED, locate, read_config, weights_sha256
 from lidargrit.evaluation.metrics import FeatureExtractor, Metric
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
-from lidargrit.generation.generator import Generator, load
-from lidargrit.inference.segment import can_label, label_images
+from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
+from lidargrit.systems.segmenter.system import Segmenter
 
 _SEGMENTER = "segmenter"
 
@@ -132,5 +132,5 @@ def segmenter_of(sensor: SensorModel, named: Path | None = None) -> Path:
 
 
 @lru_cache(maxsize=2)
-def _loaded(run: Path, device: str) -> Generator[Any, Any]:
-    return load(run).to(device)
+def _loaded(run: Path, device: str) -> Segmenter:
+    return open_segmenter(str(run), device)
