@@ -64,8 +64,8 @@ def segment_scans(
     scans = _opened(source, segmenter, config)
     scans.check_output(out)
     files = KittiTree(out).files([scans.name(index) for index in range(len(scans))])
-    facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment"))}
-    facts["scans"] = {file: scans.identity(index) for index, file in enumerate(files)}
+    identities = {file: scans.identity(index) for index, file in enumerate(files)}
+    facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment")), "scans": identities}
     missing = {index for index, file in enumerate(files) if not (out / file).exists()}
     scores = LabelScores() if numbering else None
     if scores is not None:

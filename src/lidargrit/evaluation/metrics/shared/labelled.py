@@ -64,6 +64,7 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
     bounds = (0.0, 1.0)
     variants = ("segmented", "labelled")
     needs_weights = _SEGMENTER
+    sees_objects = True
     fewest_images = 1
     accumulator = SumAccumulator
 
@@ -122,10 +123,10 @@ def segmenter_of(sensor: SensorModel, named: Path | None = None) -> Path:
     for folder, own in segmenters.items():
         if can_label(own, sensor):
             return folder
-    have = " or ".join(f"{own.name} {own.height}x{own.width}" for own in segmenters.values()) or "of a segmenter"
+    have = " or ".join(f"{own.name} {own.height}x{own.width}" for own in segmenters.values())
     raise WeightsError(
         f"range images of {sensor.name} {sensor.height}x{sensor.width} to be labelled by {named or 'the package'}",
-        f"the rows of {have}, and a multiple of its columns",
+        f"the rows of {have}, and a multiple of its columns" if have else "a segmenter's run",
         "train a segmenter of this sensor (lidargrit train segmenter_compact RUN --set data.sensor=...), and name it: "
         "--weights segmenter=RUN",
     )
