@@ -16,7 +16,8 @@ def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, 
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     load("kitti_odometry").write_example(tmp_path / "own scans", 4)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 11)  # as many as its pictures show
+    monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 2)
+    monkeypatch.setattr("lidargrit.viewer.demo._plot_pictures", lambda *_: None)  # of more samples, in test_cli.py
     monkeypatch.setattr("lidargrit.viewer.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
     few = ["training.tokenizer.scans=2", "training.transformer.scans=8", "training.pixels.scans=2"]
     assert main(["demo", "--data", str(tmp_path / "own scans"), "--set", *few]) == 0
