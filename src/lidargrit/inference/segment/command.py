@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, DataError, ScanError
 from lidargrit.core.files import claim_folder
@@ -20,7 +22,6 @@ from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.inference.segment.points import labels_of_points
 from lidargrit.inference.segment.scores import LabelScores
 from lidargrit.scans.classes import as_semantic_kitti
-from lidargrit.scans.projection import unproject
 from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
 
@@ -61,37 +62,29 @@ def segment_scans(
     """
     config, reporter = config or DataConfig(), reporter or Reporter()
     segmenter = open_segmenter(model, device)
-    scans = _opened(source, segmenter, config)
-    scans.check_output(out)
-    files = KittiTree(out).files([scans.name(index) for index in range(len(scans))])
-    identities = {file: scans.identity(index) for index, file in enumerate(files)}
+    source_scans = _opened(source, segmenter, config)
+    source_scans.check_output(out)
+    scans = _LabelledScans(source_scans, segmenter, reporter)
+    files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
+    identities = {file: source_scans.identity(index) for index, file in enumerate(files)}
     facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment")), "scans": identities}
-    missing = {index for index, file in enumerate(files) if not (out / file).exists()}
+    missing = [index for index, file in enumerate(files) if not (out / file).exists()]
     scores = LabelScores() if numbering else None
+    wanted, left_out = missing if scores is None else range(len(files)), set[int]()
     if scores is not None:
-        _own_labels(_scan(scans, 0), numbering)  # a mistake is told before anything is written
-    told = set[str]()
+        _own_labels(scans.scan(0), numbering)  # a mistake is told before anything is written
     with (
         claim_folder(out),
-        claimed_scans(out / MANIFEST, facts) as left_out,
-        reporter.progress("labelling", len(files), 0 if scores else len(files) - len(missing)) as progress,
+        claimed_scans(out / MANIFEST, facts) as files_left_out,
+        reporter.progress("labelling", len(files), len(files) - len(wanted)) as progress,
     ):
-        for index in range(len(files)) if scores else sorted(missing):
-            try:
-                scan = _scan(scans, index)
-                found = _labelled(segmenter, scans, scan, index, told, reporter)
-            except ScanError as error:
-                if config.bad_scans == "refuse":
-                    raise
-                reporter.message(f"left out: {error}")
-                left_out.add(files[index])
-            else:
-                if index in missing:
-                    write_with_labels(out / files[index], found)
-                if scores is not None:
-                    assert found.label is not None
-                    scores.add(found.label, _own_labels(scan, numbering))
+        for index, scan, label in scans.labelled(wanted, left_out if config.bad_scans == "skip" else None):
             progress.advance(1)
+            if index in missing:
+                write_with_labels(out / files[index], replace(scan, label=label))
+            if scores is not None:
+                scores.add(label, _own_labels(scan, numbering))
+        files_left_out.update(files[index] for index in left_out)
     if len(left_out) == len(files):
         raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     return len(files) - len(left_out), scores
@@ -110,33 +103,68 @@ def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans
     return scans
 
 
-def _scan(scans: NamedScans, index: int) -> Scan:
-    """Return the points of a scan with the labels that it came with."""
-    return unproject(scans.image(index)) if isinstance(scans, ImageScans) else scans.scan(index)
+class _LabelledScans:
+    """The scans of a source, and the label that a segmenter finds for every point of them.
+
+    Args:
+        scans: scans of the source.
+        segmenter: segmenter of a run.
+        reporter: receiver of the first doubt about the sensor, and of the first number of points without a label.
+    """
+
+    def __init__(self, scans: NamedScans, segmenter: Segmenter, reporter: Reporter) -> None:
+        self._scans, self._segmenter, self._reporter = scans, segmenter, reporter
+        self._reader, self._told = ScanReader(segmenter.sensor.fine(), partial=True), set[str]()
+
+    def scan(self, index: int) -> Scan:
+        """Return the points of a scan with the labels that it came with; of an image, a point for each return."""
+        return self._scans.scan(index)
+
+    def labelled(
+        self, indices: Iterable[int], skipped: set[int] | None
+    ) -> Iterator[tuple[int, Scan, Int[Tensor, " n"]]]:
+        """Yield each index with its scan and a label for every point.
+
+        Args:
+            indices: indices of scans.
+            skipped: set that gets the indices of unusable scans; None to refuse these.
+        """
+        for index in indices:
+            try:
+                scan = self.scan(index)
+                label = self._label(index, scan)
+            except ScanError as error:
+                if skipped is None:
+                    raise
+                self._reporter.message(f"left out: {error}")
+                skipped.add(index)
+            else:
+                yield index, scan, label
+
+    def _label(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
+        if isinstance(self._scans, ImageScans):
+            image = label_images(self._segmenter, RangeImage.stack([self._scans.image(index)]))
+            assert image.label is not None
+            return image.label[image.return_mask]
+        read = self._reader.read(scan)
+        assert read.point_of_pixel is not None
+        image = label_images(self._segmenter, RangeImage.stack([read.image]))[0]
+        label = labels_of_points(scan, image, read.point_of_pixel, read.method)
+        if read.doubt:
+            self._tell("doubt", f"WARNING: {read.doubt}")
+        if unlabelled := int((label == 0).sum()):
+            what = f"{unlabelled:,} of {len(scan):,} points have no return of the image nearby, and the label 0"
+            self._tell("unlabelled", f"{scan.source}: {what}; so may points of further scans")
+        return label
+
+    def _tell(self, kind: str, what: str) -> None:
+        if kind not in self._told:
+            self._told.add(kind)
+            self._reporter.message(what)
 
 
-def _labelled(
-    segmenter: Segmenter, scans: NamedScans, scan: Scan, index: int, told: set[str], reporter: Reporter
-) -> Scan:
-    """Return a scan whose every point has the label that the segmenter finds."""
-    if isinstance(scans, ImageScans):
-        return unproject(label_images(segmenter, RangeImage.stack([scans.image(index)]))[0])
-    read = ScanReader(segmenter.sensor.fine(), partial=True).read(scan)
-    if read.doubt and not told:
-        told.add(read.doubt)
-        reporter.message(f"WARNING: {read.doubt}")
-    assert read.point_of_pixel is not None
-    image = label_images(segmenter, RangeImage.stack([read.image]))[0]
-    label = labels_of_points(scan, image, read.point_of_pixel, read.method)
-    unlabelled = int((label == 0).sum())
-    if unlabelled and "unlabelled" not in told:
-        told.add("unlabelled")
-        what = f"{unlabelled:,} of {len(scan):,} points have no return of the image nearby, and the label 0"
-        reporter.message(f"{scan.source}: {what}; so may points of further scans")
-    return replace(scan, label=label)
-
-
-def _own_labels(scan: Scan, numbering: str) -> torch.Tensor:
+def _own_labels(scan: Scan, numbering: str) -> Int[Tensor, " n"]:
+    """Return the labels that a scan came with, by SemanticKITTI's numbers."""
     if scan.label is None:
         raise DataError(f"no labels in {scan.source}", "labels to compare with", "leave --compare out")
     return as_semantic_kitti(scan.label & CLASS_BITS, numbering)

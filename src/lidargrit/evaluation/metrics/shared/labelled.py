@@ -50,10 +50,10 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
     Args:
         variant: ``segmented``: both sets are labelled by one segmenter, also scans that have labels, so that its errors
             fall on both; ``labelled``: both sets have labels of their own, as simulated scans do.
-        seed: of no use here.
+        seed: seed of nothing: the metric has no random numbers.
         weights: folder of a segmenter's run; if not given, the segmenter in the package that has the images' rows.
         device: device on which the segmenter computes, such as "cuda".
-        reporter: of no use here.
+        reporter: receiver of nothing: nothing is fetched.
 
     Raises:
         WeightsError: no segmenter for the rows of the images.
