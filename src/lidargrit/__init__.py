@@ -1,7 +1,5 @@
 """LiDAR scans → tokens → new scans."""
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -1,7 +1,5 @@
 """What ``import lidargrit`` offers, in one place."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fill in what a scan lacks: rows, a sector, pixels, or rays without a point."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion

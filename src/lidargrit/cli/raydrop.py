@@ -1,7 +1,5 @@
 """Add raydrop to clean simulated scans: drop the returns that a real sensor would not get."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion

@@ -1,7 +1,5 @@
 """Label every point of scans with its class, by SemanticKITTI's numbers."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Make scans of a sensor with few rows into scans of one with more rows."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._options import add_bad_scans, add_completion

@@ -1,7 +1,5 @@
 """The classes that networks learn, those of SemanticKITTI's benchmark: numbers of labels ⇄ indices and channels."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

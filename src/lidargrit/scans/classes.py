@@ -6,8 +6,6 @@ classes of its single-scan benchmark, in which what stands and what moves is one
 and all can be seen on black and on white. The groups are ours, too: all data sets can be compared by them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 

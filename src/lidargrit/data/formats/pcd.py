@@ -1,7 +1,5 @@
 """PCD files of the Point Cloud Library, text, binary or compressed ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
@@ -91,7 +89,7 @@ class _Header:
     end: int
 
     @classmethod
-    def parse(cls, data: bytes, path: Path) -> _Header:
+    def parse(cls, data: bytes, path: Path) -> "_Header":
         words, end = _entries(data, path)
         fields, types = words.get("FIELDS", words.get("COLUMNS", ())), [one.upper() for one in words.get("TYPE", ())]
         sizes = tuple(map(whole_number, words.get("SIZE", ())))
@@ -113,7 +111,6 @@ class _Header:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of one point."""
         return sum(size * count for size, count in zip(self.sizes, self.counts, strict=True))
 
     def column_names(self) -> list[str]:

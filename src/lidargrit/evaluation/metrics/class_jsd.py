@@ -1,7 +1,5 @@
 """Share of each class among the returns, by range: two sets that a segmenter labels → Jensen-Shannon distance."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Number, size and distance of vehicles, people, poles and trunks: two sets that a segmenter labels → a distance."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """A mixture of logistic distributions of a range, cut off at the sensor's limits: numbers → density, random ranges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -45,7 +43,7 @@ class RangeMixture:
     log_scales: Float[Tensor, "*P K"]
     limits_m: tuple[float, float]
 
-    def at(self, pixels: Bool[Tensor, "*P"]) -> RangeMixture:
+    def at(self, pixels: Bool[Tensor, "*P"]) -> "RangeMixture":
         """Return the distributions of some pixels, one after the other."""
         return RangeMixture(self.logits[pixels], self.centres[pixels], self.log_scales[pixels], self.limits_m)
 
@@ -70,6 +68,11 @@ class RangeMixture:
         component = F.logsigmoid(below + width) + F.logsigmoid(-below) + (-(-width).expm1()).log()
         weighted = self.logits.log_softmax(-1) + component - self._mass().clamp(min=_LEAST_MASS).log()
         return weighted.logsumexp(-1)
+
+    def mode(self) -> Float[Tensor, "*P"]:
+        """Return the range in metres at whose component's centre the density is the highest."""
+        densest = self._log_density_at_centres(self.logits.log_softmax(-1)).argmax(-1, keepdim=True)
+        return self.centres.gather(-1, densest)[..., 0].expm1()
 
     def entropy(self, steps: RangeSteps) -> Float[Tensor, "*P"]:
         """Return the expected -ln of the probability of a step, by Gauss-Legendre quadrature over the quantiles of

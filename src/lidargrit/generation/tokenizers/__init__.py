@@ -1,7 +1,5 @@
 """The contract of a tokenizer, which turns range images into tokens and back, and how a configuration names it."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,11 +43,13 @@ class Tokenizer(Objective, Generic[Config]):
         num_codes: number of different tokens.
         grid_size: rows and columns of the token grid.
         num_features: channels of ``Decoded.features``; 0 if ``decode`` gives none.
+        num_components: components of ``Decoded.components``; 1 if ``decode`` gives ranges alone.
     """
 
     num_codes: int
     grid_size: tuple[int, int]
     num_features: int = 0
+    num_components: int = 1
 
     def __init__(self, config: Config, sensor: SensorModel) -> None:
         super().__init__(sensor)
@@ -67,7 +67,7 @@ class Tokenizer(Objective, Generic[Config]):
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
 
-    def for_decoding(self, precision: Precision) -> Tokenizer[Config]:
+    def for_decoding(self, precision: Precision) -> "Tokenizer[Config]":
         """Return a tokenizer with the same weights that only decodes, perhaps quicker or in 16 bits."""
         return self
 

@@ -1,7 +1,5 @@
 """The verbs complete, upsample and raydrop: a source, a model and a folder → files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lidargrit.core.reporting import Reporter
@@ -34,7 +32,6 @@ def complete_scans(
         pattern: choice of the observed pixels.
         output: number and kind of files.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        reporter: receiver of progress and messages.
 
     Returns:
         Number of files.

@@ -1,7 +1,5 @@
 """Scans of a user → their completions in files, which have the names of the scans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby, islice
@@ -95,12 +93,10 @@ def write_completions(
     Args:
         inputs: scans of the user.
         out: an empty folder, or one that the same command began.
-        model: model or classical method.
         condition_of: function that returns the condition for a scan and a seed.
         output: number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
-        reporter: receiver of progress and messages.
 
     Returns:
         Number of completed scans that are there now.
@@ -230,7 +226,6 @@ def _folder(turn: int, count: int) -> str:
 
 
 def _suffix(of_input: str, kind: str, sensor: SensorModel) -> str:
-    """Return the ending of a scan's file."""
     if kind == IMAGE:
         return ".npy"
     if kind:

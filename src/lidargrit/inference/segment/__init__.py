@@ -1,7 +1,5 @@
 """A segmenter and range images → their labels, also where the images have more columns than the segmenter's sensor."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The verb segment: a source of scans, a segmenter and a folder → the scans with a label for every point."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Labels of the pixels of a range image → a label for every point of its scan."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Int, Int64

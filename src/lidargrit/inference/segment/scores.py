@@ -1,7 +1,5 @@
 """Labels that were found, and true ones → the intersection over the union of each group of classes."""
 
-from __future__ import annotations
-
 from typing import Any, get_args
 
 import torch

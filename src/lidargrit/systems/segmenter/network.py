@@ -1,7 +1,5 @@
 """The network of the segmenter: ranges of the returns, and their reflectance if it is known → the class of each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

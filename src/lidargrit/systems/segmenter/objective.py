@@ -1,7 +1,5 @@
 """What trains a segmenter: labelled scans → the terms of a loss."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int

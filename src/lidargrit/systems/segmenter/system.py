@@ -1,7 +1,5 @@
 """A segmenter: scans → the class of every return, by SemanticKITTI's numbers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Bare float32 numbers of a file without a header → how many of them make a point."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float32
 

@@ -1,7 +1,5 @@
 """Range images → their labels, by a segmenter or their own, for metrics that compare what stands in two sets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Labelled range images → the vehicles, people, poles and trunks in them: where they stand, how long and how high."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
