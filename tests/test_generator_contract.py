@@ -4,6 +4,7 @@ import functools
 import itertools
 import re
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -341,7 +342,9 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
         objective = generator.objective(stage).train()
         for player in objective.players or ("",):
             rng = torch.Generator().manual_seed(0)
-            objective(Example(IMAGES.batch([0, 1])), rng, player)["loss"].backward()
+            images = IMAGES.batch([0, 1])
+            labelled = replace(images, label=torch.where(images.return_mask, 40, 0))
+            objective(Example(labelled), rng, player)["loss"].backward()
         gradients = [weight.grad for weight in objective.parameters() if weight.grad is not None]
         assert gradients
         assert all(bool(gradient.isfinite().all()) for gradient in gradients)

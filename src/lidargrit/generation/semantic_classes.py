@@ -53,8 +53,8 @@ def labels_to_learn(label: Int[Tensor, "B H W"] | None) -> Int[Tensor, "B H W"]:
     """Return the labels of training scans; refuse scans without them, with ConfigError."""
     if label is None:
         raise ConfigError(
-            "training scans without labels, for a network with labels=true",
+            "training scans without labels, for a network that learns them",
             "scans with labels, such as simulated:512:train",
-            "name such scans, or prepare them anew; or leave labels out",
+            "name such scans, or prepare them anew; or leave out labels=true, if you set it",
         )
     return label
