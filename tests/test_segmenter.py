@@ -134,8 +134,8 @@ def test_every_point_has_the_label_of_the_nearest_return_along_its_ray():
     image = project(scan, sensor, "unfolding")
     at = torch.from_numpy(index_map(scan, sensor, "unfolding").astype(np.int64))
     image = replace(image, label=torch.where(image.return_mask, torch.arange(64 * 64).view(64, 64) % 81 + 1, 0))
-    found = labels_of_points(scan, image, at, "unfolding")
     pixels = pixel_coordinates(scan, sensor, "unfolding", "exact")
+    found = labels_of_points(image, at, pixels)
     kept = {int(point) for point in at.flatten() if point >= 0}
     assert len(kept) < len(scan) / 2
     for point in [*sorted(kept)[::50], *range(0, len(scan), 97)]:

@@ -24,6 +24,9 @@ from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
 
 MANIFEST = "segmented.json"
+_FEW_RINGS_CURE = (
+    "name a segmenter of the scans' sensor with --model, or train one: lidargrit train segmenter_compact RUN"
+)
 
 
 def segment_scans(
@@ -112,7 +115,10 @@ class _LabelledScans:
 
     def __init__(self, scans: NamedScans, segmenter: Segmenter, reporter: Reporter) -> None:
         self._scans, self._segmenter, self._reporter = scans, segmenter, reporter
-        self._reader, self._told = ScanReader(segmenter.sensor.fine(), partial=True), set[str]()
+        self._reader, self._told = (
+            ScanReader(segmenter.sensor.fine(), partial=True, few_rings_cure=_FEW_RINGS_CURE),
+            set[str](),
+        )
 
     def scan(self, index: int) -> Scan:
         """Return the points of a scan with the labels that it came with; of an image, a point for each return."""
@@ -147,7 +153,7 @@ class _LabelledScans:
         read = self._reader.read(scan)
         assert read.point_of_pixel is not None
         image = label_images(self._segmenter, RangeImage.stack([read.image]))[0]
-        label = labels_of_points(scan, image, read.point_of_pixel, read.method)
+        label = labels_of_points(image, read.point_of_pixel, read.coordinates)
         if read.doubt:
             self._tell("doubt", f"WARNING: {read.doubt}")
         if unlabelled := int((label == 0).sum()):

@@ -5,15 +5,14 @@ import torch
 from jaxtyping import Int, Int64
 from torch import Tensor
 
-from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
-from lidargrit.scans.sensors import ProjectionName
-from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates
+from lidargrit.scans.types import RangeImage
 
 _WINDOWS = ((1, 2), (3, 8))  # rows and columns around a point's pixel: the second where the first has no return
 
 
 def labels_of_points(
-    scan: Scan, image: RangeImage, point_of_pixel: Int64[Tensor, "H W"], method: ProjectionName
+    image: RangeImage, point_of_pixel: Int64[Tensor, "H W"], at: PixelCoordinates
 ) -> Int[Tensor, " n"]:
     """Return a label for every point.
 
@@ -23,28 +22,26 @@ def labels_of_points(
     label is 0.
 
     Args:
-        scan: points of a scan.
         image: labelled range image (H, W) of the scan.
         point_of_pixel: index of the point that fills each pixel, -1 for none.
-        method: projection by which the points became the image.
+        at: row, column and range of every point.
 
     Source:
         Milioto et al., RangeNet++, IROS 2019, section III-D, with one neighbour in place of five.
     """
     assert image.label is not None
-    at = pixel_coordinates(scan, image.sensor, method, "exact")
     label_of_pixel, range_m = image.label.numpy(), image.range_m.numpy()
-    label = np.zeros(len(scan), np.int64)
+    label = np.zeros(len(at.range_m), np.int64)
     filled = point_of_pixel.numpy()
     label[filled[filled >= 0]] = label_of_pixel[filled >= 0]
-    without = np.ones(len(scan), bool)
+    without = np.ones(len(label), bool)
     without[filled[filled >= 0]] = False
     height, width = range_m.shape
     for rows, columns in _WINDOWS:
         left = np.flatnonzero(without)
         down, right = (each.ravel() for each in np.mgrid[-rows : rows + 1, -columns : columns + 1])
         row = np.clip(at.row[left].astype(np.int64), 0, height - 1)[:, None] + down
-        column = (at.column[left].astype(np.int64)[:, None] // image.sensor.column_stride + right) % width
+        column = (at.column[left].astype(np.int64)[:, None] + right) % width
         inside = (row >= 0) & (row < height)
         row = np.clip(row, 0, height - 1)
         apart_m = np.abs(range_m[row, column] - at.range_m[left][:, None])
