@@ -246,12 +246,13 @@ def add(options: argparse.Namespace) -> str:
     """Take the scores of a folder of ``lidargrit compare`` into scores.csv."""
     rows = read()
     held = {row.what for row in rows}
-    new = [row for row in _of_folder(options.folder, rows) if row.what not in held]
+    found = _of_folder(options.folder, rows)
+    new = [row for row in found if row.what not in held]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerows([Row._fields, *rows, *new])
     write_text(SCORES, text.getvalue())
-    return f"done: {len(new)} scores more in {SCORES}, which has {len(rows) + len(new)}"
+    return f"done: {len(new)} scores more in {SCORES}; {len(found) - len(new)} of {options.folder} were there already"
 
 
 def _of_folder(folder: Path, known: list[Row]) -> list[Row]:
