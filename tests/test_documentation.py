@@ -2,11 +2,14 @@
 
 import ast
 import contextlib
+import csv
 import importlib.util
 import inspect
+import json
 import re
 import shlex
 import tomllib
+import types
 import typing
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -164,11 +167,7 @@ def tiny_run(tmp_path_factory):
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys):
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    module = _program(path)
     for name in {"STEPS", "COUNT"} & vars(module).keys():
         setattr(module, name, 3)  # what is shown takes seconds more
     runs = [str(tiny_run)] if "run" in inspect.signature(module.main).parameters else []
@@ -179,6 +178,54 @@ def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys):
     for name in drawn:
         with Image.open(tmp_path / name) as new, Image.open(ROOT / "docs" / "pictures" / name) as shown:
             assert new.size == shown.size
+
+
+def _program(path: Path) -> types.ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_fair_table_is_what_the_scores_say(capsys, monkeypatch):
+    program, page = _program(ROOT / "benchmarks" / "fair_table.py"), TEXTS[ROOT / "docs/results/fair-table.md"]
+    for words, count in ((["table"], 20), (["ranks"], 19)):
+        monkeypatch.setattr("sys.argv", ["fair_table.py", *words])
+        program.main()
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) > count
+        assert [line for line in lines if not line.startswith("| real against real") and line not in page] == []
+
+
+def test_scores_of_a_comparison_become_rows_of_the_table(tmp_path, monkeypatch, capsys):
+    program = _program(ROOT / "benchmarks" / "fair_table.py")
+    before = program.SCORES.read_text(encoding="utf-8")
+    (scores := tmp_path / "scores.csv").write_text(before, encoding="utf-8")
+    monkeypatch.setattr(program, "SCORES", scores)
+    score = {"metric": "bev_jsd", "variant": "exact", "value": 0.25, "higher_is_better": False, "num_generated": 64}
+    score |= {"interval": {"low": 0.125, "high": 0.5}, "real_against_real": None}
+    card = {"inputs": {"reference": {"source": "/data/held_out", "sha256": "0123456789"}}, "scores": [score]}
+    cell = {"system": "r2dm_small:steps=32", "costs": {"parameters": 7, "training_flops": None}, "scores": card}
+    settings = {"flops": 1e13, "preset_settings": ["data.train=/data/mine", "seed=5"]}
+    (tmp_path / "table.json").write_text(json.dumps({"settings": settings, "cells": [cell]}), encoding="utf-8")
+    monkeypatch.setattr("sys.argv", ["fair_table.py", "add", str(tmp_path)])
+    for more in (1, 0):  # a second time adds nothing
+        program.main()
+        assert f"done: {more} scores more" in capsys.readouterr().out
+    after = scores.read_text(encoding="utf-8")
+    assert after.startswith(before)
+    row = "R2DM, 32 steps", "r2dm_small", "steps=32", "/data/mine", "1e+13", "5", "held_out", "01234567", "64"
+    assert tuple(next(csv.reader([after[len(before) :]])))[:15] == (
+        *row,
+        "bev_jsd",
+        "exact",
+        "0.25",
+        "0.125",
+        "0.5",
+        "",
+    )
 
 
 def _settings_below(config: type) -> list[type]:

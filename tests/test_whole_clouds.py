@@ -86,9 +86,18 @@ def test_columns_are_counted_from_steps_of_azimuth_with_drops_and_two_returns_of
     twice = replace(
         scan, **{name: torch.cat([getattr(scan, name)] * 2) for name in ("points_xyz_m", "reflectance", "ring")}
     )
-    assert columns_fired(scan) == columns_fired(twice) == 128
+    assert columns_fired(scan)[0] == columns_fired(twice)[0] == 128
+    assert columns_fired(scan)[1] == pytest.approx(math.pi, abs=1e-5), "each point lies in the middle of a column"
     few = Scan(scan.points_xyz_m[:10], ring=scan.ring[:10])
-    assert columns_fired(few) == 0
+    assert columns_fired(few) == (0, None)
+
+
+def test_firings_on_borders_of_columns_are_put_in_their_middle():
+    """A simulator that fires at whole multiples of a column, as CARLA and Ouster do, fills every pixel."""
+    beside = replace(DENSE.fine(), azimuth_rad=DENSE.fine().azimuth_rad + math.pi / 128)
+    full = RangeImage.masked(torch.full((64, 128), 9.0), torch.ones(64, 128, dtype=torch.bool), beside)
+    seen = Drop().see(unproject(full), network(Raydrop))
+    assert bool(seen.image.return_mask.all())
 
 
 @pytest.mark.parametrize("wanted", ["os1_64", "os1_128", "pandar64", "hdl64e_kitti_360"])

@@ -77,7 +77,8 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
                     "a tokenizer with features, such as vqvae",
                     "choose another tokenizer, or leave model.pixels out",
                 )
-            self.pixels = PixelDecoder(config.pixels, sensor, self.tokenizer.num_features)
+            tokenizer = self.tokenizer
+            self.pixels = PixelDecoder(config.pixels, sensor, tokenizer.num_features, tokenizer.num_components)
 
     @abstractmethod
     def transformer_objective(self) -> Objective:

@@ -273,6 +273,8 @@ class Decoded:
         sensor: sensor whose rays the pixels are.
         reflectance: reflectance of that surface, in [0, 1]; None from a decoder without reflectance.
         features: feature maps of the decoder, for networks that refine its output; None if it gives none.
+        components: logits, centres and log scales of the likeliest components of the range's distribution, a mixture
+            of logistic distributions of ln(1 + range in metres); None from a decoder of ranges alone.
     """
 
     range_m: Float[Tensor, "B H W"]
@@ -280,6 +282,7 @@ class Decoded:
     sensor: SensorModel
     reflectance: Float[Tensor, "B H W"] | None = None
     features: Float[Tensor, "B C H W"] | None = None
+    components: Float[Tensor, "B 3 K H W"] | None = None
 
     def threshold(self) -> RangeImage:
         """Return the scans in which every beam returns whose probability is at least 0.5."""

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from lidargrit.core.configuration import TypedSettings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import is_temperature
-from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig, RangeNetwork
+from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
+from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
@@ -105,12 +106,13 @@ class PixelDecoder(nn.Module):
         config: sizes of the networks.
         sensor: sensor with the rays and limits of the range images.
         features: number of channels of the tokenizer's features; 0 for a decoder without a tokenizer.
+        components: number of components of the distribution of a range that the tokenizer decodes.
 
     Source:
         Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
     """
 
-    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1) -> None:
         super().__init__()
         rows, columns = (
             config.coarsest_cell * 2**halvings for halvings in (config.row_halvings, config.column_halvings)
@@ -122,7 +124,9 @@ class PixelDecoder(nn.Module):
                 "lower coarsest_cell, column_halvings or row_halvings, or choose another number of columns",
             )
         self.config, self.sensor = config, sensor
-        self.mask, self.range = MaskNetwork(config, sensor, features), RangeNetwork(config, sensor, features)
+        self.mask = MaskNetwork(config, sensor, features)
+        decoded = components if config.decoded_components and features else 0
+        self.range = RangeNetwork(config, sensor, features, decoded)
 
     def forward(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
         """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.

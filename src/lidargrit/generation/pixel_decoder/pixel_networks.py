@@ -24,10 +24,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     generated_before,
     one_of_phases,
     phases_of,
-    pixels_around,
 )
-from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
-from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
@@ -36,9 +33,8 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _HALVINGS_AT_MOST = 8  # of one side alone
 _MAY_BE_0 = ("column_halvings", "row_halvings", "coarse_range_width")
-_FREE_COMPONENTS = 4  # of a range's distribution, begin at the decoded range; others begin at neighbours
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
-_FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
+_DECODED_LOG_SCALE_M = -3.0  # 5 cm
 
 
 @dataclass(frozen=True)
@@ -66,6 +62,8 @@ class PixelDecoderConfig:
         gravity_components: whether 8 more components begin on vertical planes through two earlier pixels and on
             horizontal ones through a neighbour, so that walls and the ground are continued from fewer pixels. They
             assume that the sensor is level.
+        decoded_components: whether more components are those of the range's distribution that the tokenizer decodes,
+            or one at its decoded range where it decodes no distribution; they are corrected as the mask's logits are.
         range_temperature: temperature at which ranges are sampled where the caller names none. What suits a model
             depends on its columns and its training: choose it by samples against validation scans.
     """
@@ -82,6 +80,7 @@ class PixelDecoderConfig:
     blocks: int = 2
     surface_components: bool = False
     gravity_components: bool = False
+    decoded_components: bool = False
     range_temperature: float = 0.35
 
     def __post_init__(self) -> None:
@@ -104,17 +103,21 @@ class Guide(NamedTuple):
         v: ln(1 + decoded range in metres).
         return_logits: logits of the probability of a return, bounded.
         observed: True where it was observed whether there is a return; None if nothing was observed.
+        components: logits, centres and log scales of the components of the decoded distribution of v; a single one at
+            ``v`` if only that is decoded.
     """
 
     features: Float[Tensor, "B C H W"]
     v: Float[Tensor, "B H W"]
     return_logits: Float[Tensor, "B H W"]
     observed: Bool[Tensor, "B H W"] | None = None
+    components: Float[Tensor, "B 3 K H W"] | None = None
 
     def part(self, some: slice) -> Guide:
         """Return the guide of some of the scans."""
         observed = None if self.observed is None else self.observed[some]
-        return Guide(self.features[some], self.v[some], self.return_logits[some], observed)
+        components = None if self.components is None else self.components[some]
+        return Guide(self.features[some], self.v[some], self.return_logits[some], observed, components)
 
     @classmethod
     def of(cls, decoded: Decoded) -> Guide:
@@ -130,7 +133,11 @@ class Guide(NamedTuple):
                 "leave the pixel decoder out, or choose the tokenizer vqvae",
             )
         logits = at_least_32_bits(decoded.return_logits).clamp(-LOGIT_BOUND, LOGIT_BOUND)
-        return cls(at_least_32_bits(decoded.features), at_least_32_bits(decoded.range_m).log1p(), logits)
+        v = at_least_32_bits(decoded.range_m).log1p()
+        components = decoded.components
+        if components is None:
+            components = torch.stack((torch.zeros_like(v), v, _DECODED_LOG_SCALE_M - v), 1)[:, :, None]
+        return cls(at_least_32_bits(decoded.features), v, logits, components=at_least_32_bits(components))
 
     @classmethod
     def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> Guide:
@@ -303,95 +310,3 @@ class MaskNetwork(PhaseNetwork):
             nll = self.phase_nll(chosen, guided, guide, returned)
             total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
         return total
-
-
-class RangeNetwork(PhaseNetwork):
-    """The distribution of a range, given the whole mask and the ranges of earlier pixels.
-
-    Its components are free, or begin at what the neighbours suggest: at an edge the range may be that of either side.
-    Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
-    """
-
-    added_without_tokens = 1  # the expected range
-
-    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
-        phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
-        suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
-        self.context_channels = 4 * 3 + suggest.count + suggest.distances
-        components = _FREE_COMPONENTS + suggest.count
-        widths = (config.range_width, config.coarse_range_width or config.range_width)
-        super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
-        self.suggest = suggest
-        self.limits_m = (sensor.range_min_m, sensor.range_max_m)
-        spread = torch.linspace(-0.2, 0.2, _FREE_COMPONENTS)
-        scale = torch.cat((torch.zeros(_FREE_COMPONENTS), torch.full((suggest.count,), -2.0)))
-        self.register_buffer("begin", spread[:, None, None], persistent=False)
-        self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
-
-    begin: Tensor
-    begin_scale: Tensor
-
-    def distributions(
-        self,
-        phases: list[Phase],
-        guided: dict[Lattice, Tensor],
-        guide: Guide,
-        return_mask: Bool[Tensor, "B H W"],
-        v: Float[Tensor, "B H W"],
-    ) -> RangeMixture:
-        """Return the distributions of the ranges at phases of one lattice; later ranges have no influence."""
-        candidates = self.candidates(phases, guide, return_mask, v)
-        contexts = self.context(phases, guide, return_mask, v, candidates)
-        return self.mixture(self.outputs(phases, guided, contexts), candidates)
-
-    def context(
-        self,
-        phases: list[Phase],
-        guide: Guide,
-        return_mask: Bool[Tensor, "B H W"],
-        v: Float[Tensor, "B H W"],
-        candidates: Float[Tensor, "P B K h w"],
-    ) -> Float[Tensor, "P B D h w"]:
-        """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
-        candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
-        maps = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phases[0].lattice)
-        returned, beside = maps.chunk(2, 1)
-        generated = generated_before(phases, returned) * returned
-        apart = self.suggest.differences(candidates.flatten(0, 1)).unflatten(0, candidates.shape[:2])
-        dropped = (1 - returned).expand_as(generated)
-        parts = [generated, dropped, generated * beside, (candidates - expected).clamp(-2, 2), apart]
-        if not self.guided_by_tokens:
-            parts[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
-            parts.append(expected - TYPICAL_LOG_RANGE)
-        return torch.cat(parts, 2)
-
-    def candidates(
-        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "P B K h w"]:
-        """Return what neighbours suggest, as ln(1 + range), and last what is expected without them.
-
-        Expected is the decoded range, or without tokens the mean of the neighbours.
-        """
-        return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
-
-    def _candidates(
-        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
-    ) -> Float[Tensor, "B K h w"]:
-        expected = guide.v[(..., *phase.pixels)]
-        if not self.guided_by_tokens and phase.rank:
-            near, known = pixels_around(phase, v, return_mask, phase.neighbours)
-            count, total = known.sum(1), torch.where(known, near, 0.0).sum(1)
-            expected = torch.where(count > 0, total / count.clamp(min=1), expected)
-        return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
-
-    def mixture(self, output: Float[Tensor, "P B O h w"], candidates: Float[Tensor, "P B K h w"]) -> RangeMixture:
-        """Return the distributions of the ranges of the pixels of phases of one lattice."""
-        logits, moved, scales = output.chunk(3, 2)
-        free = candidates[:, :, -1:] + 2 * (moved[:, :, :_FREE_COMPONENTS] + self.begin)
-        centres = torch.cat((free, candidates[:, :, :-1] + 0.1 * moved[:, :, _FREE_COMPONENTS:]), 2)
-        low, high = (math.log1p(limit) for limit in self.limits_m)
-        centres = centres.clamp(low, high)
-        log_scales_m = (1.5 * (scales + self.begin_scale)).clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
-        log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
-        logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
-        return RangeMixture(logits, centres, log_scales, self.limits_m)

@@ -71,6 +71,11 @@ class RangeMixture:
         weighted = self.logits.log_softmax(-1) + component - self._mass().clamp(min=_LEAST_MASS).log()
         return weighted.logsumexp(-1)
 
+    def mode(self) -> Float[Tensor, "*P"]:
+        """Return the range in metres at whose component's centre the density is the highest."""
+        densest = self._log_density_at_centres(self.logits.log_softmax(-1)).argmax(-1, keepdim=True)
+        return self.centres.gather(-1, densest)[..., 0].expm1()
+
     def entropy(self, steps: RangeSteps) -> Float[Tensor, "*P"]:
         """Return the expected -ln of the probability of a step, by Gauss-Legendre quadrature over the quantiles of
         every component."""

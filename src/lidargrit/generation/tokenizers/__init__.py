@@ -45,11 +45,13 @@ class Tokenizer(Objective, Generic[Config]):
         num_codes: number of different tokens.
         grid_size: rows and columns of the token grid.
         num_features: channels of ``Decoded.features``; 0 if ``decode`` gives none.
+        num_components: components of ``Decoded.components``; 1 if ``decode`` gives ranges alone.
     """
 
     num_codes: int
     grid_size: tuple[int, int]
     num_features: int = 0
+    num_components: int = 1
 
     def __init__(self, config: Config, sensor: SensorModel) -> None:
         super().__init__(sensor)

@@ -17,6 +17,7 @@ from lidargrit.scans.types import RangeImage, Scan
 _PHASES_AT_MOST = 32  # of 256 columns: 8,192 in all, four times those of the finest sensor in the package
 _ALMOST = 0.25  # of a model's width that a sensor may lack: an HDL-64E of 2,000 columns is imaged in 2,048
 _STEPS_AT_LEAST = 500  # between neighbouring points; fewer do not show how many columns a sensor fires
+_IN_COLUMNS = 0.5  # of 1, by which all points lie at one place in their columns; about 0 where they lie anywhere
 _ONE_RAY_RAD = 2 * math.pi / 40_000  # several returns of one ray lie closer
 
 
@@ -81,18 +82,25 @@ def phase_seed(seed: int, phase: int) -> int:
     return derive_seed(seed, phase) if phase else seed
 
 
-def columns_fired(scan: Scan) -> int:
-    """Return in about how many columns the sensor of a scan fires; 0 where rings are not known, or hold few points.
+def columns_fired(scan: Scan) -> tuple[int, float | None]:
+    """Return in about how many columns the sensor of a scan fires, and the azimuth at which the first of them begins.
 
-    It is a turn over the usual step of azimuth between neighbours of a ring.
+    The number is a turn over the usual step of azimuth between neighbours of a ring; 0 where rings are not known, or
+    hold few points. The azimuth puts firings in the middle of columns; None where they lie anywhere in these.
     """
     scan = scan.measured()
     ring = known_rings(scan)
     if ring is None:
-        return 0
+        return 0, None
     x, y = scan.points_xyz_m.double().numpy()[:, :2].T
     azimuth_rad = np.arctan2(y, x)
     order = np.lexsort((azimuth_rad, ring))
     steps_rad, change = np.diff(azimuth_rad[order]), np.diff(ring[order])
     steps_rad = steps_rad[(change == 0) & (steps_rad > _ONE_RAY_RAD)]
-    return round(2 * math.pi / float(np.median(steps_rad))) if len(steps_rad) >= _STEPS_AT_LEAST else 0
+    if len(steps_rad) < _STEPS_AT_LEAST:
+        return 0, None
+    columns = round(2 * math.pi / float(np.median(steps_rad)))
+    where = complex(np.exp(1j * columns * azimuth_rad).mean())
+    if abs(where) < _IN_COLUMNS:
+        return columns, None
+    return columns, math.pi + float(np.angle(-where * np.exp(-1j * columns * math.pi))) / columns

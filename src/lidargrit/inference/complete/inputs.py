@@ -23,12 +23,11 @@ from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
+from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
-
-_KEPT_UNTOLD = 0.95  # of a scan's points; the rest are strays, or nearer than the sensor's limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,19 +145,12 @@ class Inputs:
         points = self._scans.scan(index)
         scan = self._reader.read(points) if see is None else see(points)
         if not self._counted and see is None:
-            self._tell_points(scan.image, len(points))
+            self._counted = True
+            self._reporter.message(told_share(scan.image, len(points)))
         if scan.doubt and not self._doubted:
             self._reporter.message(f"WARNING: {scan.doubt}")
             self._doubted = True
         return scan
-
-    def _tell_points(self, image: RangeImage, num_points: int) -> None:
-        kept, self._counted = int(image.return_mask.sum()), True
-        if kept < _KEPT_UNTOLD * num_points:
-            self._reporter.message(
-                f"the image of {image.sensor.height}x{image.sensor.width} holds {kept:,} of the {num_points:,} points "
-                "of the first scan, one a pixel; the others are left out (a sensor or model of more columns keeps more)"
-            )
 
 
 @dataclass(frozen=True)
@@ -169,11 +161,15 @@ class ScanReader:
         sensor: sensor of the image.
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
+        few_rings_cure: what to do with a scan of far fewer rows.
     """
 
     sensor: SensorModel
     variant: ProjectionVariant = "exact"
     partial: bool = False
+    few_rings_cure: str = (
+        "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor"
+    )
 
     def read(self, scan: Scan) -> InputScan:
         """Project a scan; by elevation if its rings or its firing order do not fit, but not a file that was cut off."""
@@ -181,7 +177,7 @@ class ScanReader:
             raise ScanError(
                 f"{ring_count(scan)} rings in {scan.source}",
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
-                "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor",
+                self.few_rings_cure,
             )
         method = projection_that_fits(scan, self.sensor)
         try:

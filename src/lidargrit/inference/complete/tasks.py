@@ -20,6 +20,8 @@ from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
+_TRAIN_RAYDROP = "lidargrit train raydrop_compact RUN --set data.sensor=SENSOR"
+
 
 class Task(ABC):
     """One of the verbs, as it treats one scan after the other."""
@@ -36,7 +38,7 @@ class Task(ABC):
 
     def grid(self, scan: Scan, model: SensorModel) -> RayGrid:
         """Return the rays of a whole cloud."""
-        return RayGrid.fitting(model, columns_fired(scan))
+        return RayGrid.fitting(model, *columns_fired(scan))
 
     def see(self, scan: Scan, model: Model) -> InputScan:
         """Return a cloud on the rays that all of its points lie on.
@@ -157,7 +159,8 @@ class Drop(Task):
 
     def reader(self, sensor: SensorModel, variant: ProjectionVariant) -> ScanReader:
         """Return one of whole scans."""
-        return ScanReader(sensor, variant)
+        cure = f"render clean scans with its rows, or train a network for yours: {_TRAIN_RAYDROP}"
+        return ScanReader(sensor, variant, few_rings_cure=cure)
 
     def condition(self, seen: InputScan, seed: int) -> Observed:
         """Return the ranges of all surfaces."""

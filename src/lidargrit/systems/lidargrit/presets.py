@@ -6,6 +6,7 @@ from lidargrit.generation import presets as shared
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.presets import preset, variant
 from lidargrit.generation.settings import TrainingConfig
+from lidargrit.generation.tokenizers.nearest_range import NearestRangeConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.systems.lidargrit.system import LidarGritConfig
@@ -169,7 +170,7 @@ PRESETS = {
         {
             # Fewer tokens are learned sooner, and the pixel decoder adds the detail that they leave out.
             "model.tokenizer.channel_multipliers": (1, 1, 2, 4),
-            **_NO_DROPOUT,  # which costs likelihood in so short a training, see docs/results/transformer-preset.md
+            **_NO_DROPOUT,  # which costs likelihood in so short a training, see docs/decisions/0020
             # Columns are 1.4 degrees apart and rows 0.4, so rows come closer last.
             "model.pixels": PixelDecoderConfig(16, row_halvings=2, surface_components=True, gravity_components=True),
             "training.transformer": replace(_BY_MUON, scans=40_000),
@@ -195,27 +196,20 @@ PRESETS = {
         },
     ),
     "lidargrit_fine_wide": preset(
-        "LidarGRIT with a pixel decoder: 64x1024 in 4,096 tokens, for half an hour of a GPU",
+        "LidarGRIT with a pixel decoder: 64x1024 in 2,048 tokens of nearest ranges, for half an hour of a GPU",
         replace(shared.WIDE_STREETS, train=("simulated:70000:train",), workers=16),
         LidarGritConfig(
-            # Cells of 8x2: of as many pixels as 4x4, and after as many scans they keep more of poles and trunks.
-            VqvaeConfig(
-                channels=64,
-                channel_multipliers=(1, 1, 1, 2),
-                cell_columns=2,
-                code_dim=32,
-                num_codes=2048,
-                dropout=0.0,
-                padding="wrap",
-                range_encoding="log",
-                reconstruction="returns",
-                codebook_loss="ema",
-                thin_weight=8.0,
-            ),
+            NearestRangeConfig(cell_rows=8, cell_columns=4, part_rows=1, part_columns=4),
             TransformerConfig(embedding_dropout=0.0),
-            replace(shared.PIXEL_DECODER, range_features=24, range_width=48, range_temperature=0.2),
+            replace(
+                shared.PIXEL_DECODER,
+                mask_features=6,
+                coarse_range_width=48,
+                decoded_components=True,
+                range_temperature=0.2,
+            ),
         ),
-        tokenizer=replace(_RELAYED, augmentations=("flip", "roll")),
+        tokenizer=replace(_RELAYED, scans=10_000, learning_rate=2e-3, augmentations=("flip",)),
         transformer=replace(_RELAYED, scans=120_000, optimiser="muon", learning_rate=3e-3),
         pixels=_RELAYED,
     ),

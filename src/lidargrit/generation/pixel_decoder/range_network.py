@@ -1,0 +1,139 @@
+"""The network of the distributions of ranges: masks and known ranges → mixtures, phase by phase."""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from lidargrit.generation.pixel_decoder.pixel_networks import Guide, PhaseNetwork, PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.pixel_phases import (
+    Lattice,
+    Phase,
+    cells_of,
+    generated_before,
+    phases_of,
+    pixels_around,
+)
+from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
+from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import TYPICAL_LOG_RANGE
+
+_FREE_COMPONENTS = 4  # of a range's distribution, begin at the decoded range; others begin at neighbours
+_DECODED_HEAD_START = 4.0  # of the logits of decoded components: before training they are nearly all there is
+_FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
+
+
+class RangeNetwork(PhaseNetwork):
+    """The distribution of a range, given the whole mask and the ranges of earlier pixels.
+
+    Its components are free, or begin at what the neighbours suggest: at an edge the range may be that of either side.
+    Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
+    """
+
+    added_without_tokens = 1  # the expected range
+
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int, decoded: int = 0) -> None:
+        phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
+        suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
+        self.context_channels = 4 * 3 + suggest.count + suggest.distances
+        components = _FREE_COMPONENTS + suggest.count + decoded
+        widths = (config.range_width, config.coarse_range_width or config.range_width)
+        super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
+        self.suggest, self.decoded = suggest, decoded
+        self.limits_m = (sensor.range_min_m, sensor.range_max_m)
+        spread = torch.linspace(-0.2, 0.2, _FREE_COMPONENTS)
+        scale = torch.cat((torch.zeros(_FREE_COMPONENTS), torch.full((suggest.count,), -2.0), torch.zeros(decoded)))
+        self.register_buffer("begin", spread[:, None, None], persistent=False)
+        self.register_buffer("begin_scale", scale[:, None, None], persistent=False)
+
+    begin: Tensor
+    begin_scale: Tensor
+
+    def distributions(
+        self,
+        phases: list[Phase],
+        guided: dict[Lattice, Tensor],
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+    ) -> RangeMixture:
+        """Return the distributions of the ranges at phases of one lattice; later ranges have no influence."""
+        candidates = self.candidates(phases, guide, return_mask, v)
+        contexts = self.context(phases, guide, return_mask, v, candidates)
+        decoded = None
+        if self.decoded and guide.components is not None:
+            decoded = torch.stack([guide.components[(..., *phase.pixels)] for phase in phases])
+        return self.mixture(self.outputs(phases, guided, contexts), candidates, decoded)
+
+    def context(
+        self,
+        phases: list[Phase],
+        guide: Guide,
+        return_mask: Bool[Tensor, "B H W"],
+        v: Float[Tensor, "B H W"],
+        candidates: Float[Tensor, "P B K h w"],
+    ) -> Float[Tensor, "P B D h w"]:
+        """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
+        candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
+        maps = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phases[0].lattice)
+        returned, beside = maps.chunk(2, 1)
+        generated = generated_before(phases, returned) * returned
+        apart = self.suggest.differences(candidates.flatten(0, 1)).unflatten(0, candidates.shape[:2])
+        dropped = (1 - returned).expand_as(generated)
+        parts = [generated, dropped, generated * beside, (candidates - expected).clamp(-2, 2), apart]
+        if not self.guided_by_tokens:
+            parts[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
+            parts.append(expected - TYPICAL_LOG_RANGE)
+        return torch.cat(parts, 2)
+
+    def candidates(
+        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "P B K h w"]:
+        """Return what neighbours suggest, as ln(1 + range), and last what is expected without them.
+
+        Expected is the decoded range, or without tokens the mean of the neighbours.
+        """
+        return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
+
+    def _candidates(
+        self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
+    ) -> Float[Tensor, "B K h w"]:
+        expected = guide.v[(..., *phase.pixels)]
+        if not self.guided_by_tokens and phase.rank:
+            near, known = pixels_around(phase, v, return_mask, phase.neighbours)
+            count, total = known.sum(1), torch.where(known, near, 0.0).sum(1)
+            expected = torch.where(count > 0, total / count.clamp(min=1), expected)
+        return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
+
+    def mixture(
+        self,
+        output: Float[Tensor, "P B O h w"],
+        candidates: Float[Tensor, "P B K h w"],
+        decoded: Float[Tensor, "P B 3 D h w"] | None = None,
+    ) -> RangeMixture:
+        """Return the distributions of the ranges of the pixels of phases of one lattice.
+
+        Args:
+            output: output of the network: logits, how far the centres move, and the scales.
+            candidates: suggestions of the neighbours, and last the range that is expected without them.
+            decoded: components of the decoded distribution, if the network corrects any.
+        """
+        logits, moved, scales = output.chunk(3, 2)
+        free = candidates[:, :, -1:] + 2 * (moved[:, :, :_FREE_COMPONENTS] + self.begin)
+        centres = [free, candidates[:, :, :-1]]
+        scales = 1.5 * (scales + self.begin_scale)
+        if decoded is not None:
+            own_logits, own_centres, own_log_scales = decoded.unbind(2)
+            centres.append(own_centres)
+            logits = logits + F.pad(own_logits + _DECODED_HEAD_START, (0, 0, 0, 0, logits.shape[2] - self.decoded, 0))
+            scales = scales + F.pad(own_log_scales + own_centres, (0, 0, 0, 0, scales.shape[2] - self.decoded, 0))
+        anchored = torch.cat(centres[1:], 2) + 0.1 * moved[:, :, _FREE_COMPONENTS:]
+        low, high = (math.log1p(limit) for limit in self.limits_m)
+        centres = torch.cat((free, anchored), 2).clamp(low, high)
+        log_scales_m = scales.clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
+        log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
+        logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
+        return RangeMixture(logits, centres, log_scales, self.limits_m)

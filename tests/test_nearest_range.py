@@ -1,0 +1,186 @@
+"""Tokens of the nearest range of each cell: what they name, and what is decoded of them."""
+
+import math
+
+import pytest
+import torch
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
+from lidargrit.generation.settings import Preset, TrainingConfig
+from lidargrit.generation.tokenizers.nearest_range import NearestRangeConfig, NearestRangeTokenizer
+from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.scans.example import Example
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage, TokenGrid
+from lidargrit.systems.lidargrit.system import LidarGritConfig
+from lidargrit.training import train
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64, 1)
+CONFIG = NearestRangeConfig(cell_rows=8, cell_columns=4, part_rows=2, part_columns=4, width=8, blocks=1, features=4)
+
+PIXELS = PixelDecoderConfig(
+    mask_features=2, range_features=2, mask_width=8, range_width=8, blocks=1, decoded_components=True
+)
+
+
+def tokens_by_loop(image, config):
+    """Return the tokens of one image, cell by cell and part by part."""
+    range_m, found = image.range_m.tolist(), []
+    low, high = math.log(SENSOR.range_min_m), math.log(SENSOR.range_max_m)
+    for top in range(0, SENSOR.height, config.cell_rows):
+        row = []
+        for left in range(0, SENSOR.width, config.cell_columns):
+            cell = [line[left : left + config.cell_columns] for line in range_m[top : top + config.cell_rows]]
+            returned = [r for line in cell for r in line if r > 0]
+            if not returned:
+                row.append(0)
+                continue
+            nearest, parts = min(returned), []
+            high_of_part, wide = config.cell_rows // config.part_rows, config.cell_columns // config.part_columns
+            for down in range(config.part_rows):
+                for right in range(config.part_columns):
+                    lines = cell[down * high_of_part : (down + 1) * high_of_part]
+                    part = [r for line in lines for r in line[right * wide : (right + 1) * wide] if r > 0]
+                    close = sum(r <= 1.07 * nearest for r in part)
+                    parts.append((close / len(part) if part else 0.0, close))
+            most = max(range(len(parts)), key=lambda number: parts[number][0] + 1e-3 * parts[number][1])
+            pattern = sum(2**number for number, (share, _) in enumerate(parts) if share >= 0.5 or number == most)
+            level = math.floor((math.log(nearest) - low) / (high - low) * config.levels)
+            row.append(1 + min(level, config.levels - 1) * (2 ** len(parts) - 1) + pattern - 1)
+        found.append(row)
+    return torch.tensor(found)
+
+
+def some_images(count=3, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    range_m = 2 + 60 * torch.rand(count, SENSOR.height, SENSOR.width, generator=rng) ** 3
+    mask = torch.rand(range_m.shape, generator=rng) < 0.7
+    mask[:, 8:24, 8:20] = False  # cells without a return
+    return RangeImage.masked(range_m, mask, SENSOR)
+
+
+def a_pole_before_a_wall():
+    range_m = torch.full((1, SENSOR.height, SENSOR.width), 30.0)
+    range_m[:, 16:48, 21] = 9.0  # one column wide, in cells that are four wide
+    return RangeImage.masked(range_m, torch.ones(range_m.shape, dtype=torch.bool), SENSOR)
+
+
+@pytest.mark.parametrize(("part_rows", "part_columns"), [(1, 4), (2, 2), (4, 1)])
+def test_tokens_are_those_of_a_loop_over_cells(part_rows, part_columns):
+    config = NearestRangeConfig(8, 4, part_rows, part_columns, levels=50, width=8, blocks=1, features=4)
+    images = some_images()
+    tokens = NearestRangeTokenizer(config, SENSOR).encode(images).tokens
+    assert (tokens == 0).any()
+    for index in range(len(images)):
+        assert torch.equal(tokens[index], tokens_by_loop(images[index], config))
+
+
+def test_every_code_is_decoded_within_the_limits_and_a_quarter_turn_turns_what_is_decoded():
+    tokenizer = NearestRangeTokenizer(CONFIG, SENSOR)
+    grid = torch.arange(tokenizer.num_codes)[:128].reshape(1, *tokenizer.grid_size)
+    with torch.no_grad():
+        decoded = tokenizer.decode(TokenGrid(grid, tokenizer.num_codes))
+        turned = tokenizer.decode(TokenGrid(grid.roll(4, 2), tokenizer.num_codes))
+    assert float(decoded.range_m.min()) >= SENSOR.range_min_m * 0.999
+    assert float(decoded.range_m.max()) <= SENSOR.range_max_m * 1.001
+    torch.testing.assert_close(turned.range_m, decoded.range_m.roll(16, 2))
+
+
+def test_a_pole_keeps_its_range_before_anything_is_learned_whatever_stands_behind_it():
+    images = a_pole_before_a_wall()
+    decoded = NearestRangeTokenizer(CONFIG, SENSOR).reconstruct(images)
+    error = (decoded.range_m - images.range_m).abs() / images.range_m
+    assert float(error[:, 16:48, 21].max()) < 0.03
+    assert float(error[..., 32:].max()) < 0.03, "half a level is at most 2 %"
+
+
+def test_a_generator_over_such_tokens_trains_with_a_pixel_decoder_samples_and_tells_bits(tmp_path):
+    config = LidarGritConfig(
+        CONFIG,
+        TransformerConfig(layers=1, heads=2, width=16),
+        PIXELS,
+    )
+    fit = TrainingConfig(scans=24, batch_size=4, learning_rate=1e-2, average_over_scans=0)
+    data = DataConfig(("simulated:6:train",), ("simulated:2:val",), columns=512, column_stride=8)
+    stages = {"tokenizer": fit, "transformer": fit, "pixels": fit}
+    preset = Preset(title="", generator="lidargrit", model=config, data=data, training=stages)
+    trained = train(preset, tmp_path / "run")
+    images = trained.sample([0, 1])
+    assert torch.equal(load(tmp_path / "run").sample([1]).range_m[0], images.range_m[1])
+    bits = trained.bits(images, step_mm=10).per_scan()
+    assert all(float(part.min()) > 0 and bool(part.isfinite().all()) for part in bits.values())
+
+
+def test_the_loss_falls_and_tells_the_share_of_ranges_within_5_percent():
+    torch.manual_seed(0)
+    tokenizer, images, rng = NearestRangeTokenizer(CONFIG, SENSOR), some_images(), torch.Generator()
+    optimiser = torch.optim.Adam(tokenizer.parameters(), 1e-2)
+    losses = []
+    for _ in range(30):
+        terms = tokenizer(Example(images), rng)
+        optimiser.zero_grad()
+        terms["loss"].backward()
+        optimiser.step()
+        losses.append(float(terms["loss"].detach()))
+    assert losses[-1] < 0.8 * losses[0]
+    decoded, mask = tokenizer.decode(tokenizer.encode(images)), images.return_mask
+    within = ((decoded.range_m - images.range_m).abs() <= 0.05 * images.range_m)[mask].float().mean()
+    torch.testing.assert_close(tokenizer(Example(images), rng)["within_5_percent"], within)
+
+
+def test_a_pixel_decoder_is_no_worse_than_the_distribution_that_the_tokens_tell_before_it_is_trained():
+    tokenizer, images = NearestRangeTokenizer(CONFIG, SENSOR).eval(), a_pole_before_a_wall()
+    pixels = PixelDecoder(PIXELS, SENSOR, tokenizer.num_features, tokenizer.num_components).eval()
+    with torch.no_grad():
+        decoded = tokenizer.decode(tokenizer.encode(images))
+        per_return = pixels(decoded, images).range.sum() / images.return_mask.sum()
+        of_tokens = tokenizer(Example(images), torch.Generator())["range_nats"]
+    assert float(per_return) < float(of_tokens) + 0.1
+
+
+def test_the_mode_of_a_mixture_is_its_densest_centre():
+    rng = torch.Generator().manual_seed(0)
+    logits, spread = torch.randn(200, 5, generator=rng), torch.rand(200, 5, generator=rng)
+    mixture = RangeMixture(logits, 1 + 3 * spread, torch.full((200, 5), -3.0), (1.0, 80.0))
+    densities = mixture_density_by_loop(mixture)
+    expected = mixture.centres.gather(1, densities.argmax(1, keepdim=True))[:, 0].expm1()
+    torch.testing.assert_close(mixture.mode(), expected)
+
+
+def mixture_density_by_loop(mixture):
+    """Return the density of ln(1 + range) at every centre, from the logistic density's own formula."""
+    found = torch.zeros(mixture.centres.shape, dtype=torch.float64)
+    low, high = (math.log1p(limit) for limit in mixture.limits_m)
+    for pixel in range(len(found)):
+        weights = mixture.logits[pixel].double().softmax(0)
+        for at in range(found.shape[1]):
+            for other in range(found.shape[1]):
+                centre, scale = float(mixture.centres[pixel, other]), math.exp(float(mixture.log_scales[pixel, other]))
+                below, above = (1 / (1 + math.exp(-(limit - centre) / scale)) for limit in (low, high))
+                s = 1 / (1 + math.exp(-(float(mixture.centres[pixel, at]) - centre) / scale))
+                found[pixel, at] += float(weights[other]) * s * (1 - s) / scale / (above - below)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("changes", "got"),
+    [
+        ({"cell_rows": 0}, "cell_rows=0"),
+        ({"part_columns": 3}, "part_columns=3 of cell_columns=2"),
+        ({"levels": 1}, "levels=1"),
+        ({"cell_columns": 4, "part_columns": 4, "part_rows": 4}, "levels=128 in 16 parts"),
+    ],
+)
+def test_sizes_of_which_no_codes_can_be_made_are_refused(changes, got):
+    with pytest.raises(ConfigError, match=got):
+        NearestRangeConfig(**changes)
+
+
+def test_cells_that_do_not_divide_the_image_are_refused():
+    with pytest.raises(ConfigError, match="cells of 8x24"):
+        NearestRangeTokenizer(NearestRangeConfig(cell_columns=24), SENSOR)
