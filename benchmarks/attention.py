@@ -7,8 +7,6 @@ between the ways, and the best processor time of each counts. Prints seconds, th
 difference of its result from that of 32 bits, as a share of the norm.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ Each way computes R2Flow's attention to 3x9 tokens, forward and backward, in bfl
 best processor time of each counts. Prints seconds, their ratio to ours, and the largest difference of the results.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable

@@ -7,8 +7,6 @@ first so many phases. What a score gains from one line to the next is what those
 others than those that are encoded.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 

@@ -8,8 +8,6 @@ every axis. Each scan is compressed by itself; what a file for many scans adds i
 `pip install imagecodecs`, Draco `pip install DracoPy`. `--ideal` counts the bits that the model tells, without coding.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import lzma

@@ -10,8 +10,6 @@ A value in ``table`` is the mean over the seeds of training, and its interval re
 intervals over scans to the highest. Bold: the nearest trained system, if its interval overlaps with none of theirs.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import io
@@ -93,7 +91,7 @@ class Score(NamedTuple):
     better: str
     seeds: int
 
-    def nearer_than(self, other: Score) -> bool:
+    def nearer_than(self, other: "Score") -> bool:
         """Return whether this score is better, with intervals apart."""
         return self.low > other.high if self.better == "higher" else self.high < other.low
 

@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument(
         "--batch", type=int, nargs="+", default=[8, 1], help="scans at once, in the timing; the first is plotted"
     )
-    parser.add_argument("--picture", type=Path, default=Path("docs/pictures/quality_against_seconds.png"))
+    parser.add_argument("--picture", type=Path, default=Path("quality_against_seconds.png"))
     parser.add_argument("--title", default="")
     options = parser.parse_args()
     few: list[tuple[str, int]] = []

@@ -6,8 +6,6 @@
 Runs that were trained before masks shared noise get it in this way; others learn it while they train.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 from pathlib import Path

@@ -8,8 +8,6 @@ four vertical planes and four horizontal ones, too (all). More of them are neare
 they can bring; how many bits they save is told by training.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 

@@ -12,8 +12,6 @@ the true scan, beside that of one number for all returns or for each class, whic
 `--real` asks the same of real scans, whose surfaces are their own returns.
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 

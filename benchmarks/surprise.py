@@ -11,8 +11,6 @@ decoded range, in ln(1 + range), and how unlikely its mask was by the tokenizer'
 residual of an R2DM without reflectance: how far its clean image lies from the scan to which noise was added.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace

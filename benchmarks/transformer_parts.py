@@ -8,8 +8,6 @@ training is a line of the file; the same command goes on after the last one. Pri
 validation scans, which no sampling blurs, the difference from the base seed by seed, and the training's processor time.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

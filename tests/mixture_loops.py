@@ -1,7 +1,5 @@
 """The mixture of a range in plain numbers: slow loops that tests compare with."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Small sensors, and pixel decoders with what goes into them, none of whose numbers are trained."""
 
-from __future__ import annotations
-
 import math
 
 import torch

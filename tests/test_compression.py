@@ -1,7 +1,5 @@
 """Range images come back from a compressed file to the last bit, or not at all."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Images are encoded once, whatever the batch and the precision of training around it."""
 
-from __future__ import annotations
-
 import copy
 
 import torch

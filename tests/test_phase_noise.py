@@ -1,7 +1,5 @@
 """Random numbers of masks: correlated within a phase as was learned, independent between phases, always uniform."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

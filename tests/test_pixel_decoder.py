@@ -1,7 +1,5 @@
 """The pixel decoder: exact probabilities, phases, and scans that depend on nothing but their own seed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import product

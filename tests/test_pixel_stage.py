@@ -1,7 +1,5 @@
 """The pixel decoder as a third stage: trained over a frozen tokenizer, sampled by default, scored in bits."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math

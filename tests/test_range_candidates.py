@@ -1,7 +1,5 @@
 """Candidates of a range: neighbours, and surfaces through earlier pixels, against a loop over pixels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The mixture of a range: a density between the sensor's limits, its steps, and samples at a temperature."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Stages that a preset takes from another run: as they are, trained further, or not at all."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Train in legs of some minutes: ``python benchmarks/relay leg RUN OUT``, ``unpack OUT RUN``."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

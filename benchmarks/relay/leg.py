@@ -3,8 +3,6 @@
 The first stage comes first: tokenizer, then the pixel decoder over it, then the prior over its tokens.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Iterator

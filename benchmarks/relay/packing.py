@@ -6,8 +6,6 @@ stage keeps its average alone, which is the copy that is small enough to be comm
 fresh moments.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import tarfile

@@ -3,8 +3,6 @@
 Neither waits for the other: training samples from the streets that are there, the processes add to them.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What a user types: words → one function of the library, its result, and an exit code."""
 
-from __future__ import annotations
-
 import argparse
 import errno
 import importlib

@@ -1,7 +1,5 @@
 """What a user can choose from: a kind such as "datasets" → all its names, with the facts of each."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

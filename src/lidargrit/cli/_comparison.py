@@ -1,7 +1,5 @@
 """Options of ``compare`` → the systems to compare, and what they have in common."""
 
-from __future__ import annotations
-
 import argparse
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +17,7 @@ DEFAULTS: dict[str, Any] = {
 """Settings that all systems share where the user gives none; a table that is extended keeps its own."""
 
 
-def wanted(options: argparse.Namespace) -> tuple[list[str], Benchmark]:
+def wanted(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
     """Return the systems to compare, and what they have in common."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.evaluation.benchmark import Benchmark

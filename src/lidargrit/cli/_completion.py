@@ -1,7 +1,5 @@
 """What the verbs complete, upsample and raydrop have in common: their options, and what they say in the end."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,7 +38,7 @@ def add_completion(parser: argparse.ArgumentParser, model: str, points_only: boo
     add_bad_scans(parser)
 
 
-def open_model_for(options: argparse.Namespace, task: Task, sensor: SensorModel | None) -> Model:
+def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorModel | None") -> "Model":
     """Return the model that the options name.
 
     Args:
@@ -56,7 +54,7 @@ def open_model_for(options: argparse.Namespace, task: Task, sensor: SensorModel 
     return open_model(options.model, task.kind, sensor, options.set, options.device)
 
 
-def run_task(options: argparse.Namespace, model: Model, task: Task, probability: int = 0) -> None:
+def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:
     """Do a task with every scan, and say how many points came in and went out, and how to look at them."""
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
@@ -71,7 +69,7 @@ def run_task(options: argparse.Namespace, model: Model, task: Task, probability:
     print(f"look at {'it' if found.scans == 1 else 'them'}: {_view(options, found, model)}")
 
 
-def _points(found: Written, task: Task) -> str:
+def _points(found: "Written", task: "Task") -> str:
     if not found.points_in:
         return "; completed.json says how they were made"
     made = f"{found.points_out:,} points of {found.points_in:,}"
@@ -82,14 +80,14 @@ def _points(found: Written, task: Task) -> str:
     return f": {found.points_out:,} points, {kept:,} measured and {found.points_filled:,} filled{left}"
 
 
-def _view(options: argparse.Namespace, found: Written, model: Model) -> str:
+def _view(options: argparse.Namespace, found: "Written", model: "Model") -> str:
     out = f"'{options.out}'" if " " in str(options.out) else str(options.out)
     if found.sensor_file is None:
         return f"lidargrit view {out} --sensor {model.sensor.name} --set data.columns={_columns(model)}"
     return f"lidargrit view {out} -o {options.out.name}.html"
 
 
-def _columns(model: Model) -> str:
+def _columns(model: "Model") -> str:
     sensor = model.sensor
     stride = f" data.column_stride={sensor.column_stride}" if sensor.column_stride > 1 else ""
     return f"{sensor.width * sensor.column_stride}{stride}"

@@ -1,7 +1,5 @@
 """Options that several verbs share: one wording and one meaning for each."""
 
-from __future__ import annotations
-
 import argparse
 from typing import TYPE_CHECKING
 
@@ -43,7 +41,7 @@ def add_scans(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "settings of reading scans, the same for all verbs, such as data.columns=1024")
 
 
-def scan_settings(options: argparse.Namespace, **more: int | None) -> ScanSettings:
+def scan_settings(options: argparse.Namespace, **more: int | None) -> "ScanSettings":
     """Return the settings of reading scans that the user gave.
 
     Args:

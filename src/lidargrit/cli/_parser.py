@@ -1,7 +1,5 @@
 """The command line's parser: words as a user types them → options, or one line that names the wrong word."""
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import re
@@ -69,7 +67,7 @@ class Parser(argparse.ArgumentParser):
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             raise UsageError(f"{name} {error.got}", error.wanted, error.cure) from None
 
-    def verbs(self) -> list[Parser]:
+    def verbs(self) -> "list[Parser]":
         """Return the parsers of the verbs below this one."""
         below = [action for action in self._actions if isinstance(action, argparse._SubParsersAction)]
         return [parser for action in below for parser in action.choices.values()]

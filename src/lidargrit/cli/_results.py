@@ -4,8 +4,6 @@ One meaning everywhere: ``--json`` alone prints JSON and nothing else on standar
 to that file besides the table. Progress, warnings and "done" are then on standard error.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

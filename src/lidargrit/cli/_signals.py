@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM → KeyboardInterrupt and Terminated, never in the middle of an import."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

@@ -1,7 +1,5 @@
 """Train, sample and score several systems on the same data by one protocol, and say which is better."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

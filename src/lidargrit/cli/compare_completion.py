@@ -1,7 +1,5 @@
 """Compare completions: hide parts of whole scans, fill them in by models and classical methods, and measure errors."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._options import add_device, add_scans, scan_settings

@@ -1,7 +1,5 @@
 """Compare simulated with real scans: raydrop, ranges and reflectance, with a picture of the curves."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fill in what a scan lacks: rows, a sector, pixels, or rays without a point; all measured points stay."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._completion import add_completion, open_model_for, run_task

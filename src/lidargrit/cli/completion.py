@@ -1,7 +1,5 @@
 """Print a script by which bash, zsh or fish completes lidargrit's verbs, options and names."""
 
-from __future__ import annotations
-
 import argparse
 
 EXAMPLES = """\

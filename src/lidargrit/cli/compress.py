@@ -1,7 +1,5 @@
 """Compress range images to a few bits a return with a model, losslessly once ranges are rounded to a step."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

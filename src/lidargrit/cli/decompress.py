@@ -1,7 +1,5 @@
 """Restore the range images that lidargrit compress wrote, as images or as points; a damaged file is refused."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Do everything once: scans, training, new scans, scores, and one page that shows them."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

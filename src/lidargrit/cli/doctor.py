@@ -1,7 +1,5 @@
 """Show what this machine has, and where lidargrit keeps its cache."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._results import add_json, print_result, refuse_taken

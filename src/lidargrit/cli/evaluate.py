@@ -1,7 +1,5 @@
 """Score samples against real scans, measure a run's reconstruction errors, or print saved scores side by side."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

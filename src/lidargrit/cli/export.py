@@ -1,7 +1,5 @@
 """Write scans or samples as point clouds for other programs, or as a KITTI tree."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Find the rows, columns and limits of a sensor in its scans, and write them as a sensor file."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Import the weights that a system's authors published: .pth files → a run folder."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

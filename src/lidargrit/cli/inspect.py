@@ -1,7 +1,5 @@
 """Show which points a projection keeps, which it loses, and how far it moves those that it keeps."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

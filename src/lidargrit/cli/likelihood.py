@@ -1,7 +1,5 @@
 """Measure the likelihood of scans under a model, in bits: tokens, mask and ranges."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """List data sets, formats, sensors, generators, metrics, protocols, presets and more."""
 
-from __future__ import annotations
-
 import argparse
 import textwrap
 

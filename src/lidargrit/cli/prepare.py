@@ -1,7 +1,5 @@
 """Project scans once: range images in compressed shards, by many processes, taken up again where stopped."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Write a folder for the Hugging Face hub: a run's weights and configuration, with a model card; uploads nothing."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Add raydrop to clean simulated scans: drop the points that a real sensor would not get."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._completion import add_completion, open_model_for, run_task

@@ -1,7 +1,5 @@
 """Reproduce a table of the paper: prepare, train, sample, score, and print it beside the published rows."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

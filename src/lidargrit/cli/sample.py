@@ -1,7 +1,5 @@
 """Write new scans with a trained run; the same command goes on where it stopped."""
 
-from __future__ import annotations
-
 import argparse
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Generate, complete, compare and save scans on a page in the browser, on this machine."""
 
-from __future__ import annotations
-
 import argparse
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scans of procedural streets as files, in the layout of KITTI odometry, with labels and poses."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

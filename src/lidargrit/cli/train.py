@@ -1,7 +1,5 @@
 """Train a preset; the same command goes on where it stopped."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Add the rows between those of a sensor with few; all measured points stay."""
 
-from __future__ import annotations
-
 import argparse
 
 from lidargrit.cli._completion import add_completion, open_model_for, run_task

@@ -1,7 +1,5 @@
 """Show scans, samples and runs side by side on one scale, as a PNG or a page to turn and step through."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Arrays that others wrote: the bytes of an .npy or .npz → numpy arrays, their sizes checked before memory is taken."""
 
-from __future__ import annotations
-
 import math
 import struct
 import warnings

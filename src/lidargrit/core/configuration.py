@@ -1,7 +1,5 @@
 """Frozen dataclasses ⇄ JSON, and single settings changed by name: ``training.tokenizer.batch_size=4``."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

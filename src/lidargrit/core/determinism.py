@@ -1,7 +1,5 @@
 """Choices that come out the same in every run: seeds derived from seeds, evenly spaced subsets, the order of files."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The file name is the public name: a kind, such as "datasets" → its names, and the object of each."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Folders that environment variables name: $LIDARGRIT_CACHE, $XDG_CACHE_HOME and others → absolute paths."""
 
-from __future__ import annotations
-
 import os
 from functools import cache
 from pathlib import Path

@@ -12,8 +12,6 @@ LidarGritError (ValueError)
 └── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
 """
 
-from __future__ import annotations
-
 import difflib
 import re
 from collections.abc import Iterable, Sequence
@@ -35,7 +33,7 @@ class LidarGritError(ValueError):
         self.got, self.wanted, self.cure = one_line(got), one_line(wanted), one_line(cure)
         super().__init__(f"got {self.got}; wanted {self.wanted}; {self.cure}")
 
-    def __reduce__(self) -> tuple[type[LidarGritError], tuple[str, str, str]]:
+    def __reduce__(self) -> "tuple[type[LidarGritError], tuple[str, str, str]]":
         return type(self), (self.got, self.wanted, self.cure)
 
 

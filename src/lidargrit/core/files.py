@@ -1,7 +1,5 @@
 """Atomic files, and folders that one process holds: text, JSON, tensors → disk."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json
@@ -137,11 +135,7 @@ def _partial_file(folder: Path) -> Iterator[Path]:
 
 
 def _lock(folder: Path, kind: int) -> int:
-    """Lock a folder for this process and return the open lock file.
-
-    Raises:
-        OutputError: another process holds it.
-    """
+    """Lock a folder for this process and return the open lock file."""
     attempts = count(1)
     while True:
         with _missing(next(attempts)):  # as in _partial_file
@@ -323,7 +317,7 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, Any] | None = None) -> None:
+def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", about: Mapping[str, Any] | None = None) -> None:
     """Write tensors and what is to be known about them into one safetensors file, atomically."""
     from safetensors import SafetensorError  # noqa: PLC0415  quick start of commands that write no weights
     from safetensors.torch import save  # noqa: PLC0415
@@ -339,7 +333,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
         temporary.write_bytes(data)  # its save_file would put another file, without our lock, in this one's place
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_tensors(path: Path) -> "tuple[dict[str, Tensor], dict[str, Any]]":
     """Read tensors and what is known about them from a safetensors file.
 
     Raises:
@@ -360,7 +354,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise _unreadable(CheckpointError, path, why, "a complete safetensors file", cure) from None
 
 
-def _opened_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def _opened_tensors(path: Path) -> "tuple[dict[str, Tensor], dict[str, Any]]":
     from safetensors import safe_open  # noqa: PLC0415
 
     with safe_open(path, framework="pt") as opened:

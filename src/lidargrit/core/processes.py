@@ -4,8 +4,6 @@
 that lies among somebody's downloads would then run in place of Python's own module, with the user's rights.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -101,7 +99,6 @@ def _terminate(processes: set[BaseProcess]) -> None:
 
 
 def _begin(begin: Callable[[], None] | None) -> None:
-    """Prepare a process of a pool."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends Ctrl-C to all; the first process ends the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if begin is not None:

@@ -1,7 +1,5 @@
 """Progress and messages of long work: silent by default, a progress bar on a terminal, lines in a log file."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -40,7 +38,7 @@ class Reporter:
         """Show how far a piece of work is and how long it will still take."""
         yield Progress()
 
-    def of_process(self, name: str) -> Reporter:
+    def of_process(self, name: str) -> "Reporter":
         """Return the reporter of one of several processes that work at the same time; its lines begin with a name."""
         return self
 

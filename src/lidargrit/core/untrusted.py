@@ -3,8 +3,6 @@
 All bounds of what a command line, a JSON file or a message may ask for stand here; those of arrays in ``arrays.py``.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

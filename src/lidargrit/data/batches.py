@@ -1,7 +1,5 @@
 """Training batches as a function of the scans seen so far; the number of threads that read ahead has no influence."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Simulated drives as files: seeds → a tree laid out as KITTI odometry and SemanticKITTI are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,7 +35,6 @@ class DriveConfig:
     """Settings of simulated drives.
 
     Args:
-        sensor: sensor to simulate.
         seed: seed of the first street; each further street has the next seed.
         frames: scans of each street, 0.1 s apart; with 1, every scan shows another street. A street ends after 100 m.
         theme: kind of street.
@@ -89,9 +86,7 @@ def write_drives(
     Args:
         out: an empty folder, or a folder that the same simulation began; scans can be added to it.
         num_scans: total number of scans.
-        config: settings of the simulation.
         workers: number of parallel processes.
-        reporter: receiver of progress messages.
 
     Returns:
         Number of scans that are there now.

@@ -1,7 +1,5 @@
 """Scans for other programs: samples, prepared scans or a data set → a folder of point clouds, or a KITTI tree."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -64,7 +62,6 @@ def export_scans(
         kind: a format's name or one of its endings ("pcd", "npz", ...), or ``kitti_odometry`` for the tree
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        reporter: receiver of progress and messages.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
         change: what turns each scan into that of another sensor; scans stay as they are if not given.
 
@@ -143,7 +140,6 @@ def check_names(source: str, names: Sequence[str]) -> None:
     """Raise DataError if several scans of a source have one name, or would be one file: the last would replace others.
 
     Args:
-        source: source, for the message.
         names: name or file of each scan.
     """
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):

@@ -1,7 +1,5 @@
 """Range images on disk → batches in memory, of only the images that are asked for."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +19,6 @@ class Pixels(NamedTuple):
     """The pixels of one image.
 
     Args:
-        range_m: range in metres, 0 where there is no return.
-        reflectance: reflectance in [0, 1]; None if it is not known.
         label: class by SemanticKITTI's numbers, 0 where it is not known; None if it is not known anywhere.
     """
 
@@ -47,7 +43,7 @@ class Provenance:
     fingerprints: tuple[str, ...] = ()
     range_fingerprints: tuple[str, ...] = ()
 
-    def overlap(self, other: Provenance) -> str:
+    def overlap(self, other: "Provenance") -> str:
         """Return in a few words what two sets share; "" if they share nothing that is known.
 
         Two scans are the same if their files, their pixels or their ranges are. Scans of one drive show the same
@@ -84,7 +80,6 @@ class RangeImages:
     """Range images of one sensor, in one or more stores, numbered through.
 
     Args:
-        sensor: sensor of the images that are returned.
         stores: sources of images that are as wide as the sensor's, or that have all of its fine columns.
     """
 
@@ -94,7 +89,7 @@ class RangeImages:
         self._ends = list(accumulate(len(store) for store in self._stores))
 
     @classmethod
-    def joined(cls, sensor: SensorModel, parts: Sequence[RangeImages]) -> RangeImages:
+    def joined(cls, sensor: SensorModel, parts: "Sequence[RangeImages]") -> "RangeImages":
         """Join the images of several sets into one set, in their order."""
         return cls(sensor, [store for part in parts for store in part._stores])
 

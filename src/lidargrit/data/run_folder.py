@@ -1,7 +1,5 @@
 """The folder of a finished run, or of a bundle of runs: its name → its files, and what they say of its training."""
 
-from __future__ import annotations
-
 import json
 import string
 from collections.abc import Iterable, Iterator
@@ -89,7 +87,6 @@ class SavedConfig(NamedTuple):
     Args:
         generator: name of its generator.
         config: configuration of the generator, as plain values.
-        sensor: sensor whose range images the generator generates.
     """
 
     generator: str

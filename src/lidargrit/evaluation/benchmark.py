@@ -1,7 +1,5 @@
 """Presets, finished runs and samples → each trained, sampled and scored alike → one table; goes on where it stopped."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -81,7 +79,6 @@ class Benchmark:
         """Return a preset with the settings and the budget that all systems get.
 
         Args:
-            name: name of the preset.
             check: whether it is still to be trained, so that its stages have to follow the settings.
 
         Raises:
@@ -109,7 +106,6 @@ def run(
         folder: output folder. It gets a run folder ``runs/PRESET``, and for each system ``SYSTEM/samples``, scores in
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
-        reporter: receiver of the progress.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
 
     Raises:
@@ -167,7 +163,7 @@ def _require_a_metric(settings: EvalConfig, reporter: Reporter) -> None:
     raise errors[0]
 
 
-def _check_reference(reference: Source, plans: Sequence[_Plan], benchmark: Benchmark, reporter: Reporter) -> None:
+def _check_reference(reference: Source, plans: "Sequence[_Plan]", benchmark: Benchmark, reporter: Reporter) -> None:
     """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
     config = benchmark.evaluation().data_config()
     for sensor in {json.dumps(plan.sensor.to_json()): plan.sensor for plan in plans}.values():
@@ -176,7 +172,7 @@ def _check_reference(reference: Source, plans: Sequence[_Plan], benchmark: Bench
         images.batch([0])  # the size of a file is known once it is read
 
 
-def _warn_of_bounds(plans: Sequence[_Plan], reference: Source, reporter: Reporter) -> None:
+def _warn_of_bounds(plans: "Sequence[_Plan]", reference: Source, reporter: Reporter) -> None:
     """Warn of rows that bound the scores of another data set than the reference's: theirs has to be trained on."""
     unclear = {"", "folder", data_set_of(reference.text)[0] or reference.data_set}  # a folder's may be any data set
     presets = {plan.system: plan.preset for plan in plans if plan.preset is not None}
@@ -195,7 +191,7 @@ def _warn_of_bounds(plans: Sequence[_Plan], reference: Source, reporter: Reporte
 
 
 def _finish(
-    plans: Sequence[_Plan], folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
+    plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
 ) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
@@ -312,8 +308,6 @@ class _Plan:
         system: name of the system, as the user typed it.
         run: folder of a finished run, or of the one that the preset gets, or of samples.
         preset: preset that is trained; None for a finished run.
-        sampling: settings of the generator's own ``Sampling``.
-        sensor: sensor of the system's samples.
         samples: the samples, if they are there; None otherwise.
     """
 
@@ -325,7 +319,7 @@ class _Plan:
     samples: Source | None = None
 
     @classmethod
-    def of(cls, system: str, folder: Path, benchmark: Benchmark) -> _Plan:
+    def of(cls, system: str, folder: Path, benchmark: Benchmark) -> "_Plan":
         name, settings = name_and_settings(system)
         run, trained = locate(name), folder / "runs" / name
         if is_run(run):

@@ -1,7 +1,5 @@
 """Two names and a configuration → scores or errors of reconstruction: what ``lidargrit evaluate`` does."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -41,7 +39,6 @@ def evaluate(
         samples: name of the first set: samples, any source of scans, or a finished run.
         reference: name of the second set.
         config: metrics, protocol and projection of the comparison.
-        reporter: receiver of progress and warnings.
         report: file for a report; a run has none.
         write_report: function that writes the report.
         overwrite: whether a report that is there already is replaced.
@@ -142,11 +139,7 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
 
 
 def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None) -> None:
-    """Refuse options of scoring samples, which have no meaning for the reconstructions of a run.
-
-    Raises:
-        ConfigError: one of them is given.
-    """
+    """Refuse options of scoring samples, which have no meaning for the reconstructions of a run."""
     given = {
         "--report": report is not None,
         "--metrics": bool(config.metrics),
@@ -174,11 +167,7 @@ def _has_columns(config: EvalConfig) -> bool:
 
 
 def _refuse_unused(samples: Source, config: EvalConfig) -> None:
-    """Refuse a sensor or columns for generated images, which keep their own, and weights that no metric needs.
-
-    Raises:
-        ConfigError: one of them is given.
-    """
+    """Refuse a sensor or columns for generated images, which keep their own, and weights that no metric needs."""
     if config.sensor and isinstance(samples, (SampleSource, TensorSource)):
         raise ConfigError(
             f"--sensor {config.sensor} for {samples.text}, which holds {samples.kind}",

@@ -1,7 +1,5 @@
 """Samples and a reference, by a protocol: two sources → a scorecard."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -1,7 +1,5 @@
 """Errors of completion: whole scans with hidden parts → errors of the filled pixels."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence
@@ -92,7 +90,6 @@ def compare_completion(
         patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
         completions: number of completions of each scan by a model that is random.
         seed: seed of the first completion, and of the random pixels.
-        reporter: receiver of progress and warnings.
 
     Returns:
         scores of all models by the first pattern, then by the next.

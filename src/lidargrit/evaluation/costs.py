@@ -1,7 +1,5 @@
 """What a system of a benchmark costs: parameters, operations, time and bits → costs.json → a block of the table."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,8 +48,6 @@ class Costs:
         """Write what a system costs, unless that of these weights is there, with the time of at least as many scans.
 
         Args:
-            generator: the trained generator.
-            sampling: settings of the generator's own ``Sampling``.
             preset: preset that was trained; None for a run that was given, whose training is not counted.
             timed: number of scans that were sampled just now, and seconds for each; None if none was.
         """
@@ -83,7 +79,6 @@ class Costs:
         """Add the bits a return of the reference to the file, unless those of the same scans are there.
 
         Args:
-            generator: the trained generator.
             scans: the reference.
             reporter: receiver of the reason where the system has no likelihood of these scans.
         """

@@ -4,8 +4,6 @@ The interval of a difference comes from the same half-samples as those of the tw
 compared with the same half of the reference. The chance of the reference, which is common to both, cancels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -36,7 +34,6 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
     """Compare one system with another, both scored by one protocol against the same scans.
 
     Args:
-        name: name of the system.
         card: scores of the system.
         other_name: name of the system that it is compared with.
         other: scores of that other system.

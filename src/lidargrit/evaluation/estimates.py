@@ -1,7 +1,5 @@
 """Values of single scans → their mean, or the ratio of two means, with a 95 % interval."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +28,7 @@ class Estimate:
     high: float
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Estimate:
+    def of(cls, values: Sequence[float]) -> "Estimate":
         """Return the mean of one value a scan, without those that are NaN, with Student's interval over groups."""
         every = np.asarray(values, dtype=float)
         present = every[~np.isnan(every)]
@@ -38,7 +36,7 @@ class Estimate:
         return cls._around(mean, every)
 
     @classmethod
-    def of_ratio(cls, values: Sequence[float], counts: Sequence[float]) -> Estimate:
+    def of_ratio(cls, values: Sequence[float], counts: Sequence[float]) -> "Estimate":
         """Return the sum of the values by the sum of the counts, such as bits by returns, with the same interval.
 
         Source:
@@ -56,7 +54,7 @@ class Estimate:
         return f"{self.value:{form}}{interval}"
 
     @classmethod
-    def _around(cls, estimate: float, values: Float64[np.ndarray, " n"]) -> Estimate:
+    def _around(cls, estimate: float, values: Float64[np.ndarray, " n"]) -> "Estimate":
         groups = [values[group.start : group.stop] for group in blocks(len(values), _GROUPS)]
         means = np.asarray([group[~np.isnan(group)].mean() for group in groups if not np.isnan(group).all()])
         if len(means) < 2:

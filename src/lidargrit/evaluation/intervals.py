@@ -12,8 +12,6 @@ Source:
     factor (n - d) / d is 1 for d = n / 2); Politis, Romano and Wolf, Subsampling, 1999, chapter 2.
 """
 
-from __future__ import annotations
-
 import math
 import pickle
 import zlib

@@ -1,7 +1,5 @@
 """Likelihood of scans under a model: range images → bits with intervals, and maps of bits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -37,7 +35,6 @@ class Likelihood:
     """Bits of all scans of a set, with ranges rounded to one step.
 
     Args:
-        step_mm: step in millimetres that ranges are rounded to.
         is_whole: whether the bits name the whole scan, or only its tokens.
         names: name of each scan.
         parts: bits of each scan, by the name of the part: ``tokens``, ``mask``, ``range``.
@@ -113,8 +110,6 @@ def score_likelihood(
     Args:
         generator: model with the capability ``likelihood``.
         images: range images of its sensor.
-        step_mm: step in millimetres that ranges are rounded to.
-        reporter: receiver of progress.
         maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
 
     Raises:
@@ -189,11 +184,8 @@ def likelihood_of_source(
     Args:
         text: source of scans.
         model: finished run; scans are projected with its sensor, in the way of its training.
-        step_mm: step in millimetres that ranges are rounded to.
-        config: settings of reading and projecting scans.
         reporter: receiver of progress, and of a warning if the model has learned from these scans.
         maps: file to write the bits of every pixel to; none if not given.
-        device: device to compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: a model without probabilities, or a step that is not one.

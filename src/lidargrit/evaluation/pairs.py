@@ -1,7 +1,5 @@
 """The two sets of an evaluation: sources → equally many range images of each, and warnings about the comparison."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +25,6 @@ class EvalSet:
     """One set of range images that goes into the metrics.
 
     Args:
-        source: name of the source, as the user typed it.
         images: all images of the source.
         indices: indices of the images that are compared.
         range_m: nearest and farthest range of a return, in metres, both excluded; None for no limits.
@@ -137,7 +134,6 @@ def pair_for_protocol(
         reference: source of the second set; scans are projected with the sensor of the first.
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.
-        reporter: receiver of the progress of the projection.
         sensor: sensor that scans are imaged with, in place of the protocol's; samples that are images keep theirs.
 
     Raises:
@@ -174,7 +170,7 @@ class _Opened:
     doubts: tuple[str, ...]
 
     @classmethod
-    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> _Opened:
+    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> "_Opened":
         images = source.images(sensor, config, reporter)
         return cls(source, images, source.projection_variant(config), source.doubts)
 

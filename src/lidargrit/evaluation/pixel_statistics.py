@@ -1,7 +1,5 @@
 """Real scans → scans of pixel statistics: each pixel is that of another scan, so that no shape is left."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -21,7 +19,6 @@ def pixel_statistics(scans: EvalSet, indices: Sequence[int], seed: int) -> Itera
     Args:
         scans: set that holds the scans.
         indices: numbers of the scans to shuffle, at least two.
-        seed: seed of the random order.
 
     Yields:
         batches of scans, as many in all as there are indices. Where they do not fit into memory at once, each batch

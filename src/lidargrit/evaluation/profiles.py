@@ -1,7 +1,5 @@
 """Summaries of sets of range images: sets → mean images, and the most similar pairs of scans, to plot."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Drops of a model on clean scans, and independent drops → distances of their curves from those of true drops."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -89,7 +87,6 @@ def raydrop_model(word: str, device: str = "") -> Generator:
 
     Args:
         word: folder of a finished run, or ``pretrained``.
-        device: device to compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: a run that cannot do one of both; no such device.

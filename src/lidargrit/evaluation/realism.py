@@ -1,7 +1,5 @@
 """Real scans, simulated scans, and independent drops of one rate → distances between their curves."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -137,13 +135,10 @@ def scans_of_both(
     """Simulate scans, and open the real scans that they are compared with.
 
     Args:
-        source: source of real scans.
         count: number of simulated scans, and largest number of real ones, which are evenly spaced.
         sensor: name or ``.json`` file of the sensor; the data set's own if empty.
         fine: whether all columns that the sensor fires are taken; otherwise those that its image keeps.
         seed: seed of the first simulated scan.
-        config: settings for reading and projecting scans.
-        reporter: receiver of the progress.
     """
     if count < 2 or seed < 0:
         got = f"{counted_scans(count)} from seed {seed}"
@@ -169,7 +164,6 @@ def simulate_pair(seed: int, rays: SensorModel, firing: SensorModel | None = Non
     """Simulate one scan and return both of its images: see :func:`pair_of`.
 
     Args:
-        seed: seed of the scan.
         rays: rays of the images.
         firing: sensor that fires. If it has other columns than ``rays``, all of its points are projected, so that the
             nearest of several may fill a pixel, as in a real scan. If not given, it fires once for each pixel.
@@ -209,7 +203,6 @@ def distance(
     """Return the distance of one curve of generated scans from that of real ones.
 
     Args:
-        name: name of a metric.
         generated: batches of generated scans.
         real: batches of real scans.
     """

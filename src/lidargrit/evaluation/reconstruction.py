@@ -1,7 +1,5 @@
 """Errors of a tokenizer's reconstructions: pairs of real and decoded range images → errors."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 import torch
@@ -171,7 +169,7 @@ class ReconstructionScore:
         self._of_scans = self._of_scans + torch.stack([measure(*pairs).sum() for measure in _OF_SCANS.values()])
         self._scans_with_returns += int(has_returns.sum())
 
-    def merge(self, other: ReconstructionScore) -> None:
+    def merge(self, other: "ReconstructionScore") -> None:
         """Take in what another process has gathered."""
         for key, value in vars(other).items():
             setattr(self, key, getattr(self, key) + value)
@@ -226,9 +224,7 @@ def score_run(
     Args:
         run: finished run.
         source: scans that the tokenizer encodes and decodes.
-        config: settings of reading and projecting scans.
         reporter: receiver of progress, and of a warning if the model has learned from these scans.
-        device: device that the networks compute on.
 
     Raises:
         ConfigError: a run whose generator has no tokenizer.

@@ -1,7 +1,5 @@
 """A table of the paper, a folder of scans → its systems prepared, trained, sampled, scored; goes on where stopped."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -169,7 +167,6 @@ def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = No
         wanted: the table and its data.
         folder: output folder, as in :func:`lidargrit.evaluation.benchmark.run`. The same call continues there:
             prepared scans (in the cache), checkpoints, samples and scores are not made again.
-        reporter: receiver of the progress.
 
     Raises:
         DataError: the root does not hold the data set, or a split of it.

@@ -1,7 +1,5 @@
 """The result of an evaluation, with everything needed to repeat it: scores → table, JSON, and back."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,7 +35,6 @@ class EvalSetRecord:
     """Entry of one evaluation set in a score file: what remains of the set when its images are gone.
 
     Args:
-        source: source, as the user named it.
         data_set: name of the data set; "samples" for generated scans.
         split: name of the split.
         scans: number of scans of the set.
@@ -122,7 +119,7 @@ class Scorecard:
         }
 
     @classmethod
-    def read(cls, path: Path) -> Scorecard:
+    def read(cls, path: Path) -> "Scorecard":
         """Read what :meth:`to_json` returned from a file.
 
         Raises:
@@ -142,7 +139,7 @@ class Scorecard:
             raise DataError(f"{path}, which cannot be used ({type(error).__name__}: {error})", wanted, cure) from None
 
     @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Scorecard:
+    def from_json(cls, data: dict[str, Any]) -> "Scorecard":
         """Return what :meth:`to_json` made plain values of; other values raise one of Python's own errors."""
         protocol = dict(data["protocol"])
         return cls(

@@ -1,7 +1,5 @@
 """Two sets and a list of metrics → scores with intervals and reference rows; shared features are computed once."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
@@ -27,10 +25,6 @@ class MetricFactory:
 
     Args:
         choice: the metric with its variant.
-        seed: seed of all random numbers of the metric.
-        weights: file with the weights of its network; found or fetched if not given.
-        device: device on which its network computes.
-        reporter: receives messages and the progress of a download.
     """
 
     choice: MetricChoice
@@ -111,7 +105,6 @@ def score_metrics(
         factories: functions that make the metrics.
         pair: the two sets.
         resampling: settings of the intervals and of real against real.
-        reporter: receives the progress.
         with_pixel_statistics: whether each score gets that of pixel statistics, if there are four scans or more.
 
     Returns:

@@ -1,7 +1,5 @@
 """The folder of a benchmark: settings, costs and scores of all systems ⇄ table.json, which can be extended."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Several systems side by side: files of scores → text, Markdown or LaTeX; published scores in blocks of their own."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Poles and trunks of labelled range images → how many of them still stand in what was made of these images."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

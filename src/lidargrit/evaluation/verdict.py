@@ -12,8 +12,6 @@ A score counts as lost wherever its metric sees a difference. It counts as won o
 statistics from real scans: of one that does not, a good score says little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What callers pass to a generator is checked, and its scans are computed in batches of one size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterator, Sequence
 from numbers import Integral
 from typing import overload
@@ -42,7 +40,6 @@ def in_batches(seeds: Sequence[int], size: int, compute: Callable[[list[int], Ba
     """Compute one scan for each seed in batches of one size.
 
     Args:
-        seeds: seeds, one for each scan.
         size: number of scans of a batch.
         compute: function from the indices and the seeds of a batch to its scans; those of the copies are dropped, and
             may be left out.
@@ -68,7 +65,6 @@ def check_seeds(seeds: Sequence[int], count: int | None = None) -> None:
     """Refuse seeds that are out of bounds, none at all, or another number of them than there are images.
 
     Args:
-        seeds: seeds, one for each scan.
         count: number of images; None where the seeds alone say how many scans are wanted.
     """
     if not isinstance(seeds, Sequence | np.ndarray):  # a set has no order by which the scans could be told apart
@@ -102,9 +98,7 @@ def check_observed(condition: Observed, kinds: Collection[ConditionKind], sensor
     """Refuse observations of other rays, and those of a kind that a generator does not take.
 
     Args:
-        condition: condition that a caller gave.
         kinds: kinds that the generator takes.
-        sensor: sensor of the generator.
         name: name of the generator, for the message.
     """
     check_images(condition, sensor)

@@ -1,7 +1,5 @@
 """The runs of a bundle beside the one that samples: a condition → the run that was trained for what is known of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Generic, TypeVar
 
@@ -22,11 +20,7 @@ class Bundle(Generic[RunT]):
         self._runs, self._read = runs, dict[Job, RunT]()
 
     def shares(self, condition: Observed) -> Iterator[tuple[RunT | None, list[int]]]:
-        """Yield each run with the indices of the scans that it completes; None for those that no run was trained for.
-
-        Args:
-            condition: observed part of each scan.
-        """
+        """Yield each run with the indices of the scans that it completes; None for those that no run completes."""
         jobs: list[Job] = [job_of(condition[[index]]) for index in range(len(condition))]
         for job in dict.fromkeys(jobs):
             yield self._run(job), [index for index, each in enumerate(jobs) if each == job]

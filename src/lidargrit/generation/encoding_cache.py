@@ -1,7 +1,5 @@
 """Frozen networks that an objective computes with, and images encoded by one, each once: range images → tensors."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -32,7 +30,7 @@ class Frozen(Generic[NetworkT]):
         """Return the network on a device."""
         return self._network.to(device)
 
-    def __deepcopy__(self, memo: dict[int, object]) -> Frozen[NetworkT]:
+    def __deepcopy__(self, memo: dict[int, object]) -> "Frozen[NetworkT]":
         return self
 
 

@@ -1,7 +1,5 @@
 """Facts about a generative system: what it generates and where it comes from → lines for a person."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Base class of generators: seeds → range images; saving to a folder, and loading."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -49,7 +47,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     capabilities: ClassVar[frozenset[str]] = frozenset()
     is_random: ClassVar[bool] = True
     """Whether two seeds give two scans."""
-    bundle: Bundle[Generator[Any, Any]] | None = None
+    bundle: "Bundle[Generator[Any, Any]] | None" = None
     """Runs that complete scans in its place where it was read from a bundle."""
     facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
     training_precision: ClassVar[Precision] = "auto"
@@ -331,7 +329,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return cls.facts.lines(cls.capabilities, configuration.leaves(cls.Sampling()), cls.not_of_sampling)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Generator[Any, Any]:
+    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> "Generator[Any, Any]":
         """Make a generator with the weights that the system's authors published, or that their program saved.
 
         Args:
@@ -350,7 +348,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         )
 
     @classmethod
-    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> Generator[Any, Any]:
+    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> "Generator[Any, Any]":
         """Read a generator from a folder, or from a repository of the Hugging Face hub.
 
         Args:

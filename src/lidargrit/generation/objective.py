@@ -1,7 +1,5 @@
 """What a stage of training minimises: (examples, random numbers) → the terms of a loss."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import torch
@@ -76,7 +74,7 @@ class Objective(nn.Module, ABC):
         """
         return 0
 
-    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+    def weights_from(self, trained: "Objective") -> dict[str, Tensor]:
         """Return the weights of a trained objective of this kind in the shapes of this one's, where that is possible.
 
         Training goes on from them; weights that the trained one lacks keep the values that they have.
@@ -101,7 +99,6 @@ def hidden_in_some(
         pixels: labels by SemanticKITTI's numbers, or reflectance.
         unknown: value of an unknown pixel.
         share: probability that a scan's pixels are hidden.
-        rng: source of the choice.
     """
     kept = torch.rand((len(pixels), 1, 1), generator=rng, device=rng.device) >= share
     return torch.where(kept.to(pixels.device), pixels, unknown)

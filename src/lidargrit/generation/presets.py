@@ -1,7 +1,5 @@
 """A preset is an entry of a table: name → :class:`Preset`; and what the presets of several systems share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -145,7 +143,6 @@ def preset(
         title: description in one line.
         data: settings of the data.
         model: configuration of one of the systems.
-        seed: seed of everything random.
         published: scores that a paper reports.
         stages_from: run whose stages are taken.
         fine_tune: names of stages that are trained further.

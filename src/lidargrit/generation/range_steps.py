@@ -1,7 +1,5 @@
 """Ranges in whole steps of some millimetres, between a sensor's limits: metres ⇄ integers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from numbers import Integral
@@ -23,10 +21,6 @@ class RangeSteps:
 
     Multiple k stands for all ranges that are nearer to it than to another one, between the limits of the sensor: the
     first and the last interval end there.
-
-    Args:
-        sensor: sensor of the ranges.
-        step_mm: step in millimetres.
 
     Raises:
         ConfigError: a step that is no whole number of millimetres from 1 to 1000.

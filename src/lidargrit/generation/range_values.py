@@ -1,7 +1,5 @@
 """Range images ⇄ log ranges in [-1, 1], beside them reflectance; no return is a level below that of every return."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -41,7 +39,6 @@ def decode(
 
     Args:
         values: channels in [-1, 1], which are clipped to it: the encoded range, and the reflectance where there is one.
-        sensor: sensor of the images.
         returned: mask of the returns; by default the pixels whose range is longer than the sensor's shortest.
     """
     exponent = (values[:, 0].clamp(-1, 1) + 1) * (math.log2(1 + sensor.range_max_m) / 2)

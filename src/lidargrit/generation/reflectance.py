@@ -1,7 +1,5 @@
 """Reflectance in networks that take range images: what they learn from, and how far an estimate is off."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch
@@ -18,7 +16,6 @@ def required_reflectance(reflectance: Float[Tensor, "*B H W"] | None, setting: s
     """Return the reflectance of scans; refuse scans without it, with ConfigError.
 
     Args:
-        reflectance: reflectance in [0, 1]; None where the scans have none.
         setting: name of the setting by which a network takes it, for the message.
     """
     if reflectance is None:

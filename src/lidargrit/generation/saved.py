@@ -1,7 +1,5 @@
 """A network with its configuration and sensor ⇄ the two files in which it is saved, here or on the Hugging Face hub."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from collections.abc import Callable
@@ -24,12 +22,7 @@ ModelT = TypeVar("ModelT", bound="SavedModel[Any]")
 
 
 class SavedModel(nn.Module, Generic[ConfigT]):
-    """A network that is made from a configuration and a sensor, and that can be written to a folder.
-
-    Args:
-        config: settings of the network, an instance of ``Config``.
-        sensor: sensor whose range images the network takes or generates.
-    """
+    """A network that is made from a configuration and a sensor, and that can be written to a folder."""
 
     Config: ClassVar[type]
 
@@ -127,7 +120,6 @@ def read_saved(folder: Path, class_of: Callable[[str], type[ModelT]]) -> ModelT:
     """Read a network with its configuration and sensor from the folder in which it was saved.
 
     Args:
-        folder: folder of a finished run.
         class_of: function from the name of a system to its class.
 
     Raises:

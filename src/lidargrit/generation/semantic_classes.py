@@ -4,8 +4,6 @@ Source: Behley et al., SemanticKITTI, ICCV 2019: the 19 classes of its single-sc
 what moves is one class. Other structures, other objects and outliers are none of them.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

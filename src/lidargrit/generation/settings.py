@@ -1,7 +1,5 @@
 """An experiment as settings: its data, its model, and the training of each of its stages."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """Base of generators of tokens, with any tokenizer and any order of sampling."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from dataclasses import dataclass, field, fields, replace
@@ -152,12 +150,10 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
             wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
-            rngs: random generators on the CPU, one for each scan.
             mask: method by which returns and ranges are decided, checked by :meth:`check_choice`.
             pixels: settings by which the pixel decoder samples masks and ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
             condition: observed part of the scans, which a pixel decoder keeps.
-
         """
         images = []
         for first in range(0, wanted, _DECODED_AT_ONCE):

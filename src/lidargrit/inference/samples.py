@@ -1,7 +1,5 @@
 """(generator, seeds) → a folder of generated scans, one a file; data/sources/samples.py reads it."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence
@@ -43,13 +41,10 @@ def write_samples(
     """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.
 
     Args:
-        generator: generator to sample from.
         run_folder: folder that the generator was read from; the hash of its weights identifies the samples.
         folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
-        sampling: choices of the generator's own ``Sampling``; its defaults if not given.
-        reporter: receiver of progress messages.
 
     Raises:
         OutputError: the folder holds samples of another model or setting, something else, cannot be written, or was

@@ -1,7 +1,5 @@
 """Attention of a transformer: queries, keys and values → mixtures of the values, by the quicker of two ways."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float

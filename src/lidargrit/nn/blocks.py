@@ -1,7 +1,5 @@
 """Base classes of networks and of their repeated blocks; compilation and recomputation in training."""
 
-from __future__ import annotations
-
 from typing import Any, TypeVar
 
 import torch
@@ -33,7 +31,6 @@ def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) 
     """Set how an objective's networks compute in training; the names and values of weights stay the same.
 
     Args:
-        objective: objective of a training stage.
         recompute: whether every block drops its activations and computes them again for the gradients, which stay the
             same, dropout included.
         compiled: whether every network is compiled when it is first called.

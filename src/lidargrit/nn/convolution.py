@@ -3,8 +3,6 @@
 Parameter names follow the reference's state dict, so that published weights load.
 """
 
-from __future__ import annotations
-
 from typing import Any, Literal
 
 import torch

@@ -5,8 +5,6 @@ token at a time, and a step takes few operations: query, key and value come from
 once, and residuals are added in place. In 32 bits the result is the transformer's own but for rounding.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """The name of a device, such as "cpu" or "cuda:1" → the device, if it exists."""
 
-from __future__ import annotations
-
 import torch
 
 from lidargrit.core.errors import ConfigError

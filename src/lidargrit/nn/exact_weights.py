@@ -1,7 +1,5 @@
 """Weights of a file → the module of the very same layout; others are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch
@@ -16,7 +14,6 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: Path) ->
 
     Args:
         module: module that gets the weights; it stays as it is if they are refused.
-        weights: weights by their names.
         source: file that they were read from.
 
     Raises:

@@ -1,7 +1,5 @@
 """The number of operations of one pass through a network, counted without computing it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import chain
 from typing import Any
@@ -30,7 +28,7 @@ class FlopCounter(TorchDispatchMode):
         self.total = 0
         self._unfused = sdpa_kernel(SDPBackend.MATH)  # fused attention hides its products from a dispatcher
 
-    def __enter__(self) -> FlopCounter:
+    def __enter__(self) -> "FlopCounter":
         self._unfused.__enter__()
         super().__enter__()
         return self

@@ -1,7 +1,5 @@
 """Inversion of a generating network: an error as a function of latents → the latents of the least error."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The number type that a network computes in: 32 bits, or 16 where the machine has instructions for them."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from typing import Literal
 

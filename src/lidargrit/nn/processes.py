@@ -1,7 +1,5 @@
 """Sums, means and samples over the processes of a training, equal to those of one process with the whole batch."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor, distributed

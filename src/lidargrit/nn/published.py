@@ -1,7 +1,5 @@
 """An untrusted file of torch.save → the tensors in it, by name, and nothing else."""
 
-from __future__ import annotations
-
 import io
 import warnings
 import zipfile
@@ -28,7 +26,6 @@ def read_checkpoint(
     """Return the weights of one network in a checkpoint of another program.
 
     Args:
-        path: path of the file.
         names: names that lead to the weights, such as ``("G_ema",)``; nothing else in the file is read.
         bytes_at_most: largest size of the file in bytes; a larger one is refused unread.
         ignored: patterns of names that are skipped, such as ``loss.*``.

@@ -1,7 +1,5 @@
 """Vector quantisation: each latent is replaced by the nearest code of a learned codebook."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Weights in 8 bits: numbers ⇄ whole numbers and the scale of every 64 of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Literal
 

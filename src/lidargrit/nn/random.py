@@ -1,7 +1,5 @@
 """Seeds → random numbers, on the CPU, so that every device gets the same; uniform numbers → random choices."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """A bound on the size of a network, checked while the network is built: settings → a network, or an error."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager

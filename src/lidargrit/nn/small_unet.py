@@ -1,7 +1,5 @@
 """A small U-Net over range images, for maps of classical hints: maps at full size → maps at full size."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -67,7 +65,6 @@ class SmallUnet(Network):
     """Maps at full size → maps at full size, through a half, a quarter and an eighth of the rows and columns.
 
     Args:
-        config: sizes of the network.
         inputs: channels of the input.
         outputs: channels of the output.
         parts: further inputs and outputs by a name of their own.

@@ -1,7 +1,5 @@
 """How many threads share a network's steps on a CPU, where a step is too small to be worth it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ They read whole sequences; ``nn.decoding`` generates token by token with the sam
 reference's state dict (a minGPT), so that published weights load.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -57,7 +55,6 @@ class Transformer(Network):
     """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
 
     Args:
-        config: sizes and dropout.
         num_inputs: number of different tokens that it reads.
         num_tokens: number of different tokens that it predicts.
         context_length: number of tokens in the longest sequence.

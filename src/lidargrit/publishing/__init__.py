@@ -1,7 +1,5 @@
 """Import and publication of weights: files of a system's authors → a run folder; a run → a folder for others."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The facts of a run → a model card: Markdown for people, with a header for the Hugging Face hub."""
 
-from __future__ import annotations
-
 import html
 import json
 import re
@@ -35,7 +33,6 @@ def model_card(
     """Return the card of a model, made from the facts in its run folder alone.
 
     Args:
-        generator: the model.
         about: content of its ``run.json``; empty if there is no such file.
         learned: recordings and images that it was trained on.
         scores: scores of its samples, if there are any.

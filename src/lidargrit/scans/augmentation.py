@@ -1,7 +1,5 @@
 """Range images → randomly changed ones for training; range, return mask, reflectance and label change together."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,13 +24,11 @@ def augment(images: RangeImage, kinds: Sequence[Augmentation], rng: torch.Genera
     """Change every image of a batch at random.
 
     Args:
-        images: batch of range images (B, H, W).
         kinds: kinds of change, made one after the other. ``flip`` mirrors left and right with probability 1/2. ``roll``
             turns the scan about the vertical axis by a random number of columns. ``geometric`` is the paper's geometric
             preservation: with probability 1/2, an affine map and flips along both axes; pixels from outside the image
             are *no return*. ``geometric_reference`` is the same with the larger rotation of the authors' program, which
             fills such pixels with returns at the longest range.
-        rng: source of all random numbers, on the CPU.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2.2 (the paper gives no numbers); numbers from the program,

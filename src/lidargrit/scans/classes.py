@@ -4,8 +4,6 @@ Source: the numbers and names are those of Behley et al., SemanticKITTI, ICCV 20
 it. The colours are ours: what moves is warm, what stands is grey or brown, and all can be seen on black and on white.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 Colour = tuple[int, int, int]

@@ -1,7 +1,5 @@
 """What is known of scans that are to be generated: nothing, or range images and masks → :class:`Observed`."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -124,7 +122,7 @@ class Observed(Condition):
                 raise ScanError(got, "values in [0, 1]", "scale it, e.g. divide an intensity of 0..255 by 255")
 
     @classmethod
-    def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Observed:
+    def of_pixels(cls, images: RangeImage, observed: Bool[Tensor, "B H W"]) -> "Observed":
         """Return the condition that some pixels of scans were observed, whether they have a return or not.
 
         Args:
@@ -139,7 +137,7 @@ class Observed(Condition):
         return cls(range_m, returned, returned, observed, images.sensor, reflectance, label)
 
     @classmethod
-    def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> Observed:
+    def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> "Observed":
         """Return the condition that the ranges of all surfaces are known, and that only surfaces can return.
 
         Args:
@@ -153,7 +151,7 @@ class Observed(Condition):
         return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)
 
     @classmethod
-    def nothing(cls, sensor: SensorModel, count: int) -> Observed:
+    def nothing(cls, sensor: SensorModel, count: int) -> "Observed":
         """Return the condition of a number of scans of which nothing was observed."""
         none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
         return cls(none.float(), none, none, none, sensor)

@@ -1,7 +1,5 @@
 """One batch of training examples: range images, and what a generator is told of each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -25,10 +23,10 @@ class Example:
     def __len__(self) -> int:
         return len(self.images)
 
-    def __getitem__(self, index: slice | list[int]) -> Example:
+    def __getitem__(self, index: slice | list[int]) -> "Example":
         """Return some of the examples."""
         return Example(self.images[index], self.condition[index])
 
-    def to(self, device: torch.device | str) -> Example:
+    def to(self, device: torch.device | str) -> "Example":
         """Return the examples with their tensors on another device."""
         return Example(self.images.to(device), self.condition.to(device))

@@ -1,7 +1,5 @@
 """All that a file of points holds, row by row → :class:`FileRows`, by which it can be written again without loss."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

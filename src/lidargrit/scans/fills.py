@@ -1,7 +1,5 @@
 """Classical methods to fill a scan in, without a network: observed pixels of one scan → all its pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,7 +42,7 @@ class SeenScan:
     azimuth_rad: Float64[np.ndarray, " W"]
 
     @classmethod
-    def of(cls, condition: Observed, index: int) -> SeenScan:
+    def of(cls, condition: Observed, index: int) -> "SeenScan":
         """Return the observed pixels of one scan of a condition."""
         observed = condition.return_observed[index]
         returned = condition.return_mask[index] & observed
@@ -62,7 +60,7 @@ class SeenScan:
         return self.nearest(self.returned)
 
     @cached_property
-    def triangles(self) -> Triangles:
+    def triangles(self) -> "Triangles":
         """Triangulation of the observed returns."""
         return triangulate(self)
 
@@ -121,7 +119,7 @@ class Triangles:
     corner_pixels: Int64[np.ndarray, "3 H W"]
 
     @classmethod
-    def none(cls, seen: SeenScan, range_m: Float64[np.ndarray, "H W"]) -> Triangles:
+    def none(cls, seen: SeenScan, range_m: Float64[np.ndarray, "H W"]) -> "Triangles":
         """Return the values for pixels without a triangle, from ranges that were filled in another way."""
         weights = np.zeros((3, *range_m.shape))
         weights[0] = 1
@@ -219,7 +217,6 @@ def fill_lacking(completed: RangeImage, condition: Observed) -> RangeImage:
 
     Args:
         completed: completed scans, on any device.
-        condition: observed part of each scan.
     """
     tells = condition.reflectance is not None and bool(condition.return_observed.any())
     lacks_reflectance = tells and completed.reflectance is None
@@ -305,10 +302,6 @@ def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
 
     Blocks of pixels are divided at random into two halves, and each half is triangulated from the returns of the other.
     So returned and dropped rays cannot be distinguished by the noise of a measured range.
-
-    Args:
-        images: batch of range images.
-        rng: source of the halves.
 
     Raises:
         ScanError: a scan without returns in one half.

@@ -3,8 +3,6 @@
 Source: Behley et al., SemanticKITTI, ICCV 2019, and the configuration published with it.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 CAR: Final = 10

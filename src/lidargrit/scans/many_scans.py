@@ -1,7 +1,5 @@
 """Many scans that are read when asked for → those of them that can be used."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 

@@ -4,8 +4,6 @@ A surface that does not return has 0, and one that returns 0.5 + reflectance / 2
 stay distinct from lost returns, and ordinary scans, whose readings below 0.5 are many, cannot be taken for such scans.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -4,8 +4,6 @@ Each is valid once it exists. Ranges are always metres and the return mask is al
 tensors live inside one model.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -102,7 +100,7 @@ class Scan:
     def __len__(self) -> int:
         return self.points_xyz_m.shape[0]
 
-    def measured(self) -> Scan:
+    def measured(self) -> "Scan":
         """Return the scan without the points that a model added."""
         if self.filled is None or bool(self.filled.all()):
             return self
@@ -177,24 +175,24 @@ class RangeImage:
         sensor: SensorModel,
         reflectance: Float[Tensor, "*batch H W"] | None = None,
         label: Int[Tensor, "*batch H W"] | None = None,
-    ) -> RangeImage:
+    ) -> "RangeImage":
         """Make a range image of a clean range and a mask: whatever else it has is set to 0 where nothing returned."""
         kept = None if reflectance is None else torch.where(return_mask, reflectance, 0.0)
         classes = None if label is None else torch.where(return_mask, label, 0)
         return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept, classes)
 
     @classmethod
-    def stack(cls, images: Sequence[RangeImage]) -> RangeImage:
+    def stack(cls, images: "Sequence[RangeImage]") -> "RangeImage":
         """Make one batch of single images of one sensor; reflectance and label are kept if every image has them."""
         return cls._joined(images, torch.stack)
 
     @classmethod
-    def cat(cls, batches: Sequence[RangeImage]) -> RangeImage:
+    def cat(cls, batches: "Sequence[RangeImage]") -> "RangeImage":
         """Make one batch of several batches of one sensor; reflectance and label are kept if every batch has them."""
         return cls._joined(batches, torch.cat)
 
     @classmethod
-    def _joined(cls, images: Sequence[RangeImage], join: Callable[[list[Tensor]], Tensor]) -> RangeImage:
+    def _joined(cls, images: "Sequence[RangeImage]", join: Callable[[list[Tensor]], Tensor]) -> "RangeImage":
         reflectance = [image.reflectance for image in images if image.reflectance is not None]
         label = [image.label for image in images if image.label is not None]
         return cls(
@@ -208,15 +206,15 @@ class RangeImage:
     def __len__(self) -> int:
         return self.range_m.shape[0] if self.range_m.ndim > 2 else 1
 
-    def __getitem__(self, index: int | slice | list[int]) -> RangeImage:
+    def __getitem__(self, index: int | slice | list[int]) -> "RangeImage":
         """Return one image of a batch, or a batch of some of its images."""
         return self.mapped(lambda pixels: pixels[index])
 
-    def to(self, device: torch.device | str) -> RangeImage:
+    def to(self, device: torch.device | str) -> "RangeImage":
         """Return the image with its pixels on another device."""
         return self.mapped(lambda pixels: pixels.to(device))
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> RangeImage:
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "RangeImage":
         """Return the image in which range, mask and whatever else it has are changed alike."""
         return replace(
             self,
@@ -325,7 +323,7 @@ class ScanBits:
     expected: Float[Tensor, "B H W"] | None = None
 
     @classmethod
-    def cat(cls, batches: Sequence[ScanBits]) -> ScanBits:
+    def cat(cls, batches: "Sequence[ScanBits]") -> "ScanBits":
         """Make one batch of several batches of one model, by one step."""
         first = batches[0]
         parts = {

@@ -1,7 +1,5 @@
 """Simulated scans: a seed → a scene of triangles → the returns of a sensor in it."""
 
-from __future__ import annotations
-
 from typing import get_args
 
 import numpy as np

@@ -3,8 +3,6 @@
 A revolution begins straight ahead and goes counter-clockwise, in the firing order of KITTI's files.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -38,14 +36,13 @@ class Beams:
     clear: Bool[np.ndarray, "H W"]
 
     @classmethod
-    def sample(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> Beams:
+    def sample(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> "Beams":
         """Aim at every fine column of a sensor, with the small jitter of a turning head.
 
         A pixel whose ray leaves its column by the jitter gets no firing.
 
         Args:
             sensor: sensor to simulate; columns that its image leaves out are included.
-            rng: source of the jitter.
             gap_share: share of pixels without a firing, which determines the strength of the jitter.
         """
         elevation, azimuth, turn, phase, clear = _aims(sensor)
@@ -56,7 +53,7 @@ class Beams:
         step = np.float32(2 * math.pi / clear.shape[1])
         return cls(elevation, azimuth - aside * step, turn, fired, clear)
 
-    def columns(self, which: slice) -> Beams:
+    def columns(self, which: slice) -> "Beams":
         """Return the rays of some columns."""
         shared = self.elevation_rad.shape[1] == 1
         return replace(

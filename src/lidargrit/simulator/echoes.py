@@ -1,7 +1,5 @@
 """Echoes of beams of finite width: beams in a scene → one echo a pixel, of one surface or a mixture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

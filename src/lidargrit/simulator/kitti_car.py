@@ -1,7 +1,5 @@
 """Facts about the car that recorded KITTI: which rays end on the car, and the gains of its lasers."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float
 

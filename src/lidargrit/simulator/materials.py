@@ -1,7 +1,5 @@
 """Materials of surfaces: a name → how the material reflects a beam of 905 nm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 
@@ -10,7 +8,6 @@ class Material:
     """Reflection properties of one kind of surface; the albedo belongs to each triangle.
 
     Args:
-        name: name of the material.
         diffuse: factor on the triangle's albedo, the share scattered evenly; clear coats and panes scatter little.
         gloss: strength of the mirror-like lobe, seen only close to normal incidence.
         lobe_power: exponent of the cosine of incidence in that lobe; the higher, the narrower.

@@ -1,7 +1,5 @@
 """Meshes of a scene: triangles, each with a material, a brightness, a class and an instance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -33,7 +31,7 @@ class Mesh:
     @classmethod
     def of(
         cls, triangles_m: Float[np.ndarray, "t 3 3"], material: int, albedo: float, label: int, instance: int = 0
-    ) -> Mesh:
+    ) -> "Mesh":
         """Make a mesh of one material, brightness, class and instance."""
         count = len(triangles_m)
         return cls(
@@ -45,11 +43,11 @@ class Mesh:
         )
 
     @classmethod
-    def join(cls, meshes: Sequence[Mesh]) -> Mesh:
+    def join(cls, meshes: "Sequence[Mesh]") -> "Mesh":
         """Make one mesh of several, in their order."""
         return cls(*(np.concatenate([getattr(mesh, field.name) for mesh in meshes]) for field in fields(cls)))
 
-    def moved(self, x_m: float, y_m: float, z_m: float = 0.0, yaw_rad: float = 0.0) -> Mesh:
+    def moved(self, x_m: float, y_m: float, z_m: float = 0.0, yaw_rad: float = 0.0) -> "Mesh":
         """Return the mesh turned about the z axis, counter-clockwise seen from above, then shifted."""
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])

@@ -1,7 +1,5 @@
 """Observation of a scene: a scene, a sensor and a random stream → surface, signal and label of every pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
@@ -78,9 +76,6 @@ class Observation:
     def scan(self, source: str) -> Scan:
         """Return the points that came back in the firing order of KITTI's files.
 
-        Args:
-            source: origin of the scan, for messages.
-
         Raises:
             ScanError: not one point came back.
         """
@@ -109,7 +104,6 @@ class Observation:
         end on the car that carries the sensor meet no surface.
 
         Args:
-            source: origin of the scan, for messages.
             limits_m: nearest and farthest range of a surface, in metres.
 
         Raises:
@@ -152,7 +146,6 @@ def observe_scene(
 
     Args:
         scene: triangles and sensor poses.
-        sensor: sensor to simulate.
         scene_rng: source of what stays the same from one revolution to the next: the gain of every object.
         beam_rng: source of what differs from one revolution to the next.
         config: time, motion, wetness and raydrop model.

@@ -1,7 +1,5 @@
 """Received power of a beam: surfaces, incidence and range → power, probability of a return, and reflectance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,7 +125,7 @@ class Surfaces:
     mottle: Float32[np.ndarray, " m"]
 
     @classmethod
-    def of(cls, mesh: Mesh, model: RaydropModel, wet: float = 0.0) -> Surfaces:
+    def of(cls, mesh: Mesh, model: RaydropModel, wet: float = 0.0) -> "Surfaces":
         """Look up the materials of a mesh, on ground between dry (``wet`` 0) and soaked (1)."""
         albedo = np.append(mesh.albedo, np.float32(0))
         material = np.append(mesh.material, np.uint8(len(model.materials)))
@@ -199,7 +197,7 @@ class Lasers:
     reading: Float32[np.ndarray, "H 1"]
 
     @classmethod
-    def of(cls, sensor: SensorModel, model: RaydropModel) -> Lasers:
+    def of(cls, sensor: SensorModel, model: RaydropModel) -> "Lasers":
         """Look up the lasers of KITTI's own sensor, or sample those of another."""
         if is_on_car(sensor) and _rows_are_lasers(sensor, len(model.laser_gains)):
             return cls(*(np.array(t, np.float32)[:, None] for t in (model.laser_gains, model.laser_readings)))
@@ -228,7 +226,7 @@ class BeamNoise:
     range_noise: Float32[np.ndarray, "H W"]
 
     @classmethod
-    def sample(cls, rng: np.random.Generator, height: int, width: int, model: RaydropModel) -> BeamNoise:
+    def sample(cls, rng: np.random.Generator, height: int, width: int, model: RaydropModel) -> "BeamNoise":
         """Sample the noise of a scan of one size."""
         num_knots = max(round(360 / model.patch_deg), 1)
         knots = rng.standard_normal((height, num_knots), dtype=np.float32) * np.float32(model.patch_spread)
@@ -243,7 +241,7 @@ class BeamNoise:
             range_noise=rng.standard_normal((height, width), dtype=np.float32),
         )
 
-    def columns(self, which: slice) -> BeamNoise:
+    def columns(self, which: slice) -> "BeamNoise":
         """Return the noise of some columns."""
         return BeamNoise(self.patch[:, which], self.pulse[:, which], self.range_noise[:, which])
 

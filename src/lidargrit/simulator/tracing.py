@@ -1,7 +1,5 @@
 """Ray casting: triangles and rays → range, triangle and incidence, with Intel's Embree, on the CPU only."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 

@@ -1,7 +1,5 @@
 """State of a stage in training (weights, their average, the optimiser) ⇄ one file."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 
@@ -27,8 +25,6 @@ def save_checkpoint(
     """Write everything that the next step depends on, atomically: an interrupted save leaves the older checkpoint.
 
     Args:
-        path: file of the checkpoint.
-        objective: objective in training.
         average: moving average of its weights.
         optimiser: optimiser with its moments.
         scans_seen: number of training scans seen so far, over all processes.
@@ -84,11 +80,7 @@ def load_average(path: Path, objective: nn.Module) -> None:
 
 
 def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
-    """Return the state of each weight by the weight's number.
-
-    Raises:
-        ValueError: a weight that there is not, a moment of another size, or one that lacks.
-    """
+    """Return the state of each weight by the weight's number."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         index, _, key = name.partition(".")

@@ -1,7 +1,5 @@
 """A preset → the floating-point operations of its training, and the preset scaled to a budget of them."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from collections.abc import Callable, Collection, Mapping
@@ -64,7 +62,6 @@ def training_flops(preset: Preset, taken: Collection[str] | None = None) -> dict
     scans do, are the steps computed.
 
     Args:
-        preset: preset whose training it is.
         taken: names of the stages that are taken from another run, if that is known already.
 
     Returns:
@@ -144,7 +141,6 @@ def with_budget(preset: Preset, flops: float) -> Preset:
     of the model that count scans only fall.
 
     Args:
-        preset: preset to scale.
         flops: number of floating-point operations that the training may take.
 
     Raises:

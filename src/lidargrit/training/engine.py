@@ -1,7 +1,5 @@
 """Devices, processes and precision by Lightning Fabric; no other file imports it."""
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -1,7 +1,5 @@
 """Loss terms of a stage in training → ``log.jsonl`` and TensorBoard's event files."""
 
-from __future__ import annotations
-
 import json
 from contextlib import suppress
 from pathlib import Path

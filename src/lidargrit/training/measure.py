@@ -1,7 +1,5 @@
 """A preset → the time and memory of its training on this machine, predicted from a few timed steps of each stage."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
 

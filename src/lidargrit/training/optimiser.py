@@ -1,7 +1,5 @@
 """Optimiser, learning rate and moving average of the weights: (configuration, scans seen) → update."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any
@@ -73,13 +71,11 @@ class _Together(torch.optim.Optimizer):
             part.param_groups, part.state, first = self.param_groups[first:last], self.state, last
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Load groups and states, and hand them to the parts."""
         super().load_state_dict(state_dict)
         self._share()
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        """Let every part take its step."""
         for part in self._parts:
             part.step()
 
@@ -110,7 +106,6 @@ class WeightAverage:
     The half-life grows with the scans seen up to ``half_life_scans``, so that early weights are soon forgotten.
 
     Args:
-        objective: objective whose weights are averaged.
         half_life_scans: number of scans after which a weight counts half; 0 for no averaging.
 
     Source:
@@ -126,7 +121,6 @@ class WeightAverage:
         """Take in the weights after a step.
 
         Args:
-            objective: objective after the step.
             scans_seen: number of training scans seen so far, over all processes.
             batch_size: number of scans in the step, over all processes.
         """

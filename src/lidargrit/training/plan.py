@@ -1,7 +1,5 @@
 """The plan of a preset's training: every setting by its name, sizes, budgets and estimated cost."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -29,9 +27,7 @@ class StagePlan:
     """Size and cost of the training of one stage.
 
     Args:
-        name: name of the stage.
         parameters: number of weights that the stage trains or uses.
-        scans: number of scans seen.
         batch_size: number of scans in a step, over all processes.
         memory: size of weights, their average, gradients and the optimiser's moments, in bytes, without activations.
         flops: number of floating-point operations of all steps.
@@ -161,7 +157,6 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     """Refuse settings of any stage that its training would refuse, and stages to take that do not fit.
 
     Args:
-        preset: preset whose stages they are.
         processes: number of processes that share each batch.
 
     Raises:

@@ -1,7 +1,5 @@
 """Preset → finished model in a run folder: the stages are trained in turn, and each resumes where it stopped."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import platform

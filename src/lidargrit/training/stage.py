@@ -1,7 +1,5 @@
 """The training loop of every model: (objective, range images, configuration) → trained weights in a folder."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil
@@ -41,11 +39,8 @@ class StageTraining:
     """One stage of a run in training.
 
     Args:
-        objective: objective that the stage minimises.
-        config: settings of the stage's training.
         folder: folder of ``checkpoint.safetensors`` and ``log.jsonl``.
         seed: seed of order, augmentation, dropout and the objective's random numbers.
-        reporter: receiver of progress and messages.
         built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
         workers: number of threads that read ahead.
         condition: source of what the generator is told of each scan.
@@ -225,8 +220,6 @@ def follow_settings(objective: Objective, config: TrainingConfig, processes: int
     """Set an objective's networks as the settings of its training say, and return the optimiser.
 
     Args:
-        objective: objective that a stage minimises.
-        config: settings of the stage's training.
         processes: number of processes that share each batch.
 
     Raises:

@@ -1,7 +1,5 @@
 """Trained stages of another run that a preset takes as they are: preset → objectives by the name of their stage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,6 @@ def donors_of_stages(preset: Preset, stages: Sequence[str]) -> dict[str, str]:
     """Return the run from which each stage is taken as it is, by the name of the stage; others are trained.
 
     Args:
-        preset: preset whose stages they are.
         stages: names of the stages of the preset's generator.
 
     Raises:
@@ -45,7 +42,6 @@ def taken_facts(preset: Preset, donors: Mapping[str, str]) -> dict[str, Any]:
     """Return what a run must tell of the weights that it takes: training scans and files of all before it.
 
     Args:
-        preset: preset that takes them.
         donors: run from which a stage is taken as it is, by the name of the stage.
 
     Returns:

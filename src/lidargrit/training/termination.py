@@ -1,7 +1,5 @@
 """SIGTERM, or the end of the time that is given → a flag, so that the step in progress is finished and saved."""
 
-from __future__ import annotations
-
 import math
 import signal
 import time
@@ -26,7 +24,7 @@ class Termination:
         """Whether training is to stop after the step in progress."""
         return self._signalled or time.monotonic() >= self._deadline_s
 
-    def __enter__(self) -> Termination:
+    def __enter__(self) -> "Termination":
         try:
             self._before = signal.signal(signal.SIGTERM, self._note)
         except ValueError:  # not the main thread

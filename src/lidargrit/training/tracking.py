@@ -1,7 +1,5 @@
 """A run's TensorBoard files → a project on Weights & Biases."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 from collections.abc import Iterator
@@ -21,7 +19,6 @@ def tracked(project: str, preset: Preset, folder: Path) -> Iterator[None]:
     Args:
         project: name of the project; "" to send nothing.
         preset: preset of the run, whose settings are sent.
-        folder: run folder.
 
     Raises:
         ConfigError: the package wandb is missing, or the service refuses.

@@ -4,8 +4,6 @@ matplotlib looks there first, and such a file may have it run LaTeX, or spoil ev
 home folder, counts as ever.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import warnings
@@ -29,7 +27,7 @@ if "matplotlib" not in sys.modules:
         os.close(_current)
 
 
-def write_png(figure: Figure, path: Path) -> None:
+def write_png(figure: "Figure", path: Path) -> None:
     """Write a figure as PNG; an older picture there is replaced in one step.
 
     Titles that hold names of files, sensors or sets have ``parse_math=False``: between two dollar signs matplotlib

@@ -1,7 +1,5 @@
 """What pages of one file share: the head with its security policy, the one script that may run, figures → HTML."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 from html import escape

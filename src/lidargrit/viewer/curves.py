@@ -1,7 +1,5 @@
 """Curves of real scans, of simulated ones, and of scans whose rays are dropped independently: scores → PNG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -36,7 +34,6 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
     Args:
         scores: scores of curves.
-        path: path of the PNG; an older picture there is replaced in one step.
         title: title of the whole picture.
 
     Raises:

@@ -1,7 +1,5 @@
 """The whole pipeline: scans → range images → trained networks → new scans → scores → one page."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,7 +64,6 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         data: a folder of scans or another source; None for simulated scans.
         folder: run folder, which also gets ``demo.html``, ``samples``, ``evaluation.json`` and two pictures.
         settings: changed settings of the preset, as ``--set`` takes them.
-        reporter: receiver of progress and messages.
         anew: whether all networks are trained anew, instead of beginning with those of the model in the package.
     """
     preset = _preset(data, settings, reporter, anew)
@@ -174,7 +171,6 @@ def write_results_page(
         card: scores of the samples against training scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
-        folder: folder of the run.
         packaged: scans sampled by the model in the package, which show what longer training gives; None to leave them
             out.
         sampling: settings by which pixels of reconstructed scans are sampled, as those of ``samples`` were.
@@ -214,7 +210,7 @@ def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSamp
     return tokenizer.sample(tokens, rngs)
 
 
-def _packaged_samples(folder: Path, clock: _Clock, reporter: Reporter) -> RangeImages:
+def _packaged_samples(folder: Path, clock: "_Clock", reporter: Reporter) -> RangeImages:
     """Sample from the model in the package, which was trained for hours, for comparison."""
     with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
         model, run = load(PRETRAINED).to(usable_device("")), locate(PRETRAINED)
@@ -239,7 +235,6 @@ def _preset(data: str | None, settings: list[str], reporter: Reporter, anew: boo
 
 
 def _trained_stages(preset: Preset) -> list[str]:
-    """Return the stages that a preset trains, in their order."""
     donors = donors_of_stages(preset, tuple(_STAGES))
     return [stage for stage in _STAGES if stage in preset.training and stage not in donors]
 

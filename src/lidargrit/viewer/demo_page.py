@@ -1,7 +1,5 @@
 """The page of the demo, for newcomers: a scan, its tokens, its reconstruction and new scans → HTML."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -144,7 +142,6 @@ def _limits_m(demo: DemoPage) -> tuple[float, float]:
 
 
 def _ranges(demo: DemoPage, image: RangeImage, caption: str, lattice: Lattice = _EVERY_PIXEL) -> str:
-    """Render a range image, or a lattice of its pixels."""
     pixels = (0, *lattice.pixels)
     range_m, returned = image.range_m[pixels].numpy(), image.return_mask[pixels].numpy()
     return figure(

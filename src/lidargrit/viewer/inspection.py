@@ -1,7 +1,5 @@
 """Losses and errors of a projection as a picture: :class:`Inspection` → PNG."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +33,6 @@ def plot_inspection(inspection: Inspection, path: Path) -> None:
 
     Args:
         inspection: result of inspecting one scan.
-        path: path of the PNG; an older picture there is replaced in one step.
 
     Raises:
         OutputError: the picture cannot be written.

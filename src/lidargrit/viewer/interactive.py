@@ -4,8 +4,6 @@ The page holds ranges in 16 bits and the rays of each sensor once; the browser c
 and style sheet are the files in ``browser/``.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -62,7 +60,6 @@ def write_page(sets: Sequence[ScanSet], path: Path) -> None:
 
     Args:
         sets: 1 to 8 sets of scans; the i-th scans of all sets are shown together.
-        path: path of the page; an older page there is replaced in one step.
 
     Raises:
         ConfigError: no set, or too many.

@@ -1,7 +1,5 @@
 """Range images side by side as a picture: groups of range images → one PNG."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -46,7 +44,6 @@ def plot_comparison(
 
     Args:
         groups: range images by name ("real", "reconstructed", ...), each one or a batch of 1 to 8; sensors may differ.
-        path: path of the PNG; an older picture there is replaced in one step.
         max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
         title: title of the whole picture.
         labels: names of the scans; "scan 1", ... if not given.
@@ -88,8 +85,6 @@ def plot_comparison(
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """One scan of one group, as arrays."""
-
     title: str
     range_m: Float[np.ndarray, "H W"]
     return_mask: Bool[np.ndarray, "H W"]
@@ -101,8 +96,6 @@ class _Panel:
 
 @dataclass(frozen=True, eq=False)
 class _Scales:
-    """Scales and colours that all panels share."""
-
     range_norm: LogNorm
     height_norm: Normalize
     half_view_m: float
@@ -110,7 +103,7 @@ class _Scales:
     height_colours: Colormap
 
     @classmethod
-    def of(cls, panels: list[_Panel], max_range_m: float | None) -> _Scales:
+    def of(cls, panels: list[_Panel], max_range_m: float | None) -> "_Scales":
         """Return scales that hold all but the outermost returns of all panels."""
         ranges = np.concatenate([panel.range_m[panel.return_mask] for panel in panels] + [np.array([1.0])])
         points = np.concatenate([panel.points_xyz_m for panel in panels] + [np.zeros((1, 3))])

@@ -1,7 +1,5 @@
 """A generator in training → a PNG of real scans, their reconstructions and new scans."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

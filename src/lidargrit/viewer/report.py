@@ -1,7 +1,5 @@
 """An evaluation as one page that needs nothing else: scorecard and the two sets → HTML."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -49,7 +47,6 @@ def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
     Args:
         card: scores and facts of the evaluation.
         pair: the two sets of scans that were compared.
-        path: path of the page; an older page there is replaced in one step.
 
     Raises:
         OutputError: the page cannot be written.

@@ -1,7 +1,5 @@
 """Scores and curves → charts inside a page: SVG in the page's own colours."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from html import escape
 

@@ -1,7 +1,5 @@
 """Arrays → pictures inside a page: PNG as data URIs."""
 
-from __future__ import annotations
-
 import base64
 import io
 

@@ -1,7 +1,5 @@
 """Sources of scans, and runs → sets of range images to look at."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +31,6 @@ class ScanSet:
 
     Args:
         name: name of the scans' source, or of what a model made of it.
-        images: a batch of range images.
         scan_names: name of each image.
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
             if no model was asked.
@@ -68,12 +65,10 @@ def load_scan_sets(
         count: number of scans of each set, evenly spaced over its source.
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
-        reporter: receiver of messages about scans that are left out.
         sensor: sensor to project scans with if the settings name none; those of runs and samples keep theirs.
         all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
             with those that its image keeps. It has no effect if the settings give a number of columns, beside samples
             and runs, nor with a ``sensor``.
-        device: device that runs compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: no source.

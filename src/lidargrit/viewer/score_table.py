@@ -1,7 +1,5 @@
 """Scores between their reference rows → the verdict in words and a table below it, in HTML."""
 
-from __future__ import annotations
-
 from html import escape
 
 from lidargrit.evaluation.intervals import Score

@@ -1,7 +1,5 @@
 """Evidence for and against a fitted sensor as a picture: :class:`SensorFit` → PNG."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,6 @@ def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
 
     Args:
         fit: fitted sensor with its residuals.
-        path: path of the PNG; an older picture there is replaced in one step.
 
     Raises:
         OutputError: the picture cannot be written.

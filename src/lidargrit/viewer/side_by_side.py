@@ -1,7 +1,5 @@
 """Sets of scans side by side on one scale: sources → a PNG, or a page to turn and step through."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -39,10 +37,8 @@ def view(
         count: number of scans of each set, evenly spaced over its source.
         seed: seed of the first generated scan.
         settings: sensor that scans are imaged with, and settings of reading them.
-        reporter: receiver of messages about scans that are left out.
         surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
             the return mask; none if empty.
-        device: device that runs compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: too few or too many scans, or no source.

@@ -1,7 +1,5 @@
 """Costs and scores of several systems → one page with a table that a reader can sort."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from html import escape

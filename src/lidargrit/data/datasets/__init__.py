@@ -1,7 +1,5 @@
 """Data sets of scans, recorded and simulated: "NAME:ROOT:SPLIT" → :class:`ScanDataset`."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections import Counter

@@ -1,7 +1,5 @@
 """Argoverse 2: ROOT/{train,val,test}/LOG/sensors/lidar/*.feather → scans of the upright one of two VLP-32C."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

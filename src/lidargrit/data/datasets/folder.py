@@ -1,7 +1,5 @@
 """Your own scans, in any format that is known and several at once: ROOT/** → scans."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """KITTI-360: ROOT/data_3d_raw/2013_05_28_drive_SSSS_sync/velodyne_points/data/*.bin → scans of 9 long drives."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

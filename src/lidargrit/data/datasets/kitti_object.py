@@ -1,7 +1,5 @@
 """KITTI object: ROOT/{training,testing}/velodyne/*.bin → single scans out of many drives."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

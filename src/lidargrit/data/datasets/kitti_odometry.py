@@ -1,7 +1,5 @@
 """KITTI odometry: ROOT/sequences/SS/velodyne/*.bin → scans of 22 drives, 11 of them with a pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """KITTI raw: ROOT/YYYY_MM_DD/DRIVE_sync/velodyne_points/data/*.bin → scans of drives, chosen by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lidargrit.data.datasets.shared.files import FileDataset

@@ -1,7 +1,5 @@
 """nuScenes: ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin → scans of 1000 scenes of 20 s, in the order of time."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Iterable
 from pathlib import Path

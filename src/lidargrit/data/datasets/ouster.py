@@ -1,7 +1,5 @@
 """Ouster recordings: ROOT/*.pcap with a .json of the same name → one scan for each revolution."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Range images as 16-bit PNG, 64 rows high: ROOT/DRIVE/*.png → scans with a ring per point."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording

@@ -1,7 +1,5 @@
 """Procedural streets, simulated when asked for: COUNT → scans, one seed each."""
 
-from __future__ import annotations
-
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.scans.types import Scan
 

@@ -1,7 +1,5 @@
 """Simulated streets with a point on every surface, marked by which beams came back and how bright: to learn raydrop."""
 
-from __future__ import annotations
-
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.scans.types import Scan
 

@@ -1,7 +1,5 @@
 """Files of scans: a path → :class:`Scan`, whichever sensor or program wrote it; one format = one file here."""
 
-from __future__ import annotations
-
 import functools
 import os
 from abc import ABC, abstractmethod
@@ -101,7 +99,7 @@ class ScanFormat(ABC):
         """Read one scan of a file, or raise ScanError."""
 
     @classmethod
-    def of_topic(cls, topic: str) -> type[ScanFormat]:
+    def of_topic(cls, topic: str) -> "type[ScanFormat]":
         """Return the format that reads one topic of a recording; itself where files have no topics."""
         return cls
 
@@ -181,7 +179,6 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
     """Read a scan from a file of any format that we know.
 
     Args:
-        path: the file.
         index: number of the scan in the file, from 0.
         bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
 

@@ -1,7 +1,5 @@
 """Argoverse 2 .feather: the points of two VLP-32C ⇄ :class:`Scan` of one of them, with a ring per point."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of text (.csv) with a header that names x, y and z ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """KITTI .bin: float32 rows x, y, z, reflectance ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

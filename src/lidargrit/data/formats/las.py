@@ -1,7 +1,5 @@
 """LAS files of the surveying world, uncompressed ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from collections.abc import Mapping
@@ -121,7 +119,6 @@ class Las(ScanFormat):
 
 
 def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
-    """Return the columns that a scan has room for."""
     columns = {axis: np.asarray(points[axis], dtype=np.float64) for axis in "xyz"}
     intensity = np.asarray(points["intensity"])
     if intensity.any():

@@ -1,7 +1,5 @@
 """NumPy's .npz of named arrays, or .npy of rows x, y, z, reflectance, ring ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

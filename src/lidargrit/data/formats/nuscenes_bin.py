@@ -1,7 +1,5 @@
 """nuScenes .pcd.bin: float32 rows x, y, z, intensity, laser of an HDL-32E ⇄ :class:`Scan` with a ring per point."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

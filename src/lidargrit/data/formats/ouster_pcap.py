@@ -1,7 +1,5 @@
 """Ouster .pcap with its .json of the same name: packets of any Ouster sensor → :class:`Scan` with a ring per point."""
 
-from __future__ import annotations
-
 import functools
 import json
 import math
@@ -178,7 +176,6 @@ def _open_once(
 
 
 def _metadata_of(path: Path) -> Path:
-    """Find the metadata of a recording."""
     metadata = path.with_suffix(".json")
     if metadata.is_file():
         return metadata

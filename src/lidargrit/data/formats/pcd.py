@@ -1,7 +1,5 @@
 """PCD files of the Point Cloud Library, text, binary or compressed ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
@@ -96,7 +94,7 @@ class _Header:
     end: int
 
     @classmethod
-    def parse(cls, data: bytes, path: Path) -> _Header:
+    def parse(cls, data: bytes, path: Path) -> "_Header":
         words, end = _entries(data, path)
         fields, types = words.get("FIELDS", words.get("COLUMNS", ())), [one.upper() for one in words.get("TYPE", ())]
         sizes = tuple(map(whole_number, words.get("SIZE", ())))
@@ -118,7 +116,6 @@ class _Header:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of one point."""
         return sum(size * count for size, count in zip(self.sizes, self.counts, strict=True))
 
     def column_names(self) -> list[str]:

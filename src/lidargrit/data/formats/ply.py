@@ -1,7 +1,5 @@
 """PLY files, text or binary of either byte order ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,7 +126,7 @@ class _Header:
     line_end: bytes
 
     @classmethod
-    def parse(cls, data: bytes, path: Path) -> _Header:
+    def parse(cls, data: bytes, path: Path) -> "_Header":
         line_end = b"\r" if data[:4] == b"ply\r" and data[4:5] != b"\n" else b"\n"
         lines, end = _lines(data, line_end, path)
         match lines[1:2]:
@@ -192,7 +190,6 @@ def _lines(data: bytes, line_end: bytes, path: Path) -> tuple[list[list[str]], i
 
 
 def _elements(lines: list[list[str]], path: Path) -> list[Element]:
-    """Return every element with its properties."""
     elements: list[Element] = []
     for line in lines:
         match line:

@@ -1,7 +1,5 @@
 """Range images as 16-bit PNG, 64 rows high ⇄ :class:`Scan` with a ring per point."""
 
-from __future__ import annotations
-
 import struct
 import warnings
 from dataclasses import replace
@@ -103,7 +101,6 @@ def _pixels(path: Path) -> UInt16[np.ndarray, "64 W"]:
 
 
 def _columns(header: bytes, path: Path) -> int:
-    """Return the number of columns that the header states."""
     if len(header) < _HEADER_BYTES or header[:8] != b"\x89PNG\r\n\x1a\n":
         raise ScanError(f"{path}, which is no PNG", _FORMAT, "convert the image, or remove the file")
     columns, rows, bits, colour = struct.unpack(">IIBB", header[16:])

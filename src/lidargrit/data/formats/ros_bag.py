@@ -1,7 +1,5 @@
 """ROS recordings (.bag, .mcap, .db3): messages sensor_msgs/PointCloud2 of one topic → :class:`Scan`."""
 
-from __future__ import annotations
-
 import functools
 import sqlite3
 import warnings
@@ -61,7 +59,7 @@ class RosBag(ScanFormat):
         return first_bytes(path, 16).startswith(tuple(_MAGIC.values()))
 
     @classmethod
-    def of_topic(cls, topic: str) -> type[RosBag]:
+    def of_topic(cls, topic: str) -> "type[RosBag]":
         """Return the format of the clouds of one topic."""
         methods = {"count": cls.count, "read": cls.read} if topic else {}
         bound = {name: staticmethod(functools.partial(method, topic=topic)) for name, method in methods.items()}
@@ -98,9 +96,7 @@ class _Recording(Protocol):
     notes: tuple[str, ...]
     """Sentences on what is not read."""
 
-    def message(self, index: int) -> Any:
-        """Return one PointCloud2, by its number."""
-        ...
+    def message(self, index: int) -> Any: ...
 
 
 def _open(path: Path, topic: str) -> _Recording:
@@ -134,7 +130,6 @@ def _chosen(topics: Counter[str], path: Path, types: Collection[str], wanted: st
 
     Args:
         topics: number of point clouds of each topic.
-        path: path of the recording.
         types: types of all its messages.
         wanted: topic that the user chose; "" for none.
     """

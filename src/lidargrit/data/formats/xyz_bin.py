@@ -1,7 +1,5 @@
 """float32 rows x, y, z without reflectance, also named .bin ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

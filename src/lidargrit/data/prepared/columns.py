@@ -1,7 +1,5 @@
 """Prepared images → images of the same scans with fewer columns, as a projection to these would give them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidargrit.core.errors import ConfigError

@@ -1,7 +1,5 @@
 """Settings of the data: which scans are read, and how they become range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -80,7 +78,7 @@ class ScanSettings:
     projection_variant: ProjectionVariant | None = None
 
     @classmethod
-    def read(cls, settings: Sequence[str] = (), **options: str | int | None) -> ScanSettings:
+    def read(cls, settings: Sequence[str] = (), **options: str | int | None) -> "ScanSettings":
         """Read words such as ``data.projection=spherical``, and options that have a name of their own.
 
         Args:

@@ -1,7 +1,5 @@
 """A few scans of a set → the projection for all of them, and signs of a wrong sensor."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from lidargrit.core.determinism import evenly_spaced
@@ -52,7 +50,6 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     Args:
         source: name of the set, for notes and doubts.
         dataset: scans of the set. Simulated ones are looked at only if they are of another sensor.
-        sensor: sensor of the images.
         config: settings of the projection; one that is named there comes before the sensor's own.
     """
     if config.projection != "sensor":

@@ -1,7 +1,5 @@
 """Sources of scans → prepared range images, projected once by many processes, and resumed where they were stopped."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time
@@ -52,10 +50,8 @@ def prepare(
     """Project every scan of a source into a folder of shards; shards that are there already are kept.
 
     Args:
-        source: source of scans, as :func:`lidargrit.data.datasets.open_dataset` takes it.
         config: settings by which scans become images, number of processes, and treatment of bad scans.
         folder: prepared folder; if not given, one in the cache, named by everything that the pixels depend on.
-        reporter: receiver of progress and messages.
         sensor: sensor of the images, in place of the config's.
         rank: number of this machine, from 0; it makes its part of the shards and waits for those of the others. If not
             given, the environment's ``RANK``, else 0.
@@ -100,7 +96,6 @@ class Prepared:
     """Size and content of a prepared folder.
 
     Args:
-        folder: path of the folder.
         images: number of images.
         rows: number of rows of an image.
         columns: number of fine columns of an image.

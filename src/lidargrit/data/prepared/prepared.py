@@ -1,7 +1,5 @@
 """A prepared folder, on this machine or behind a URL, with a plan and shards → range images."""
 
-from __future__ import annotations
-
 import copy
 import threading
 from collections import Counter
@@ -70,7 +68,7 @@ class PreparedSpec:
         """Return whether an index, of images and of scans that were left out, is that of a shard."""
         return sorted([*(entry.scan for entry in entries), *left_out]) == list(self.scans_of(shard))
 
-    def differences(self, other: PreparedSpec) -> list[str]:
+    def differences(self, other: "PreparedSpec") -> list[str]:
         """Return the names of the fields that differ from another's."""
         mine, theirs = asdict(self), asdict(other)
         return [name for name in mine if mine[name] != theirs[name]]
@@ -134,7 +132,6 @@ class PreparedFolder:
         """Read a whole JSON file of bounded size and depth.
 
         Args:
-            name: name of the file.
             kind: required type of the whole, dict or list.
             at_most: largest size, in bytes.
 
@@ -151,7 +148,7 @@ class PreparedFolder:
             entries = self.read_json(PLAN_FILE)
             spec = PreparedSpec(**entries)
             for field in fields(PreparedSpec):  # the plain types; the sensor checks itself
-                kind = {"int": int, "float": (int, float), "str": str}.get(str(field.type), dict)
+                kind = {int: int, float: (int, float), str: str}.get(field.type, dict)
                 if not isinstance(getattr(spec, field.name), kind) or isinstance(getattr(spec, field.name), bool):
                     raise TypeError(f"{field.name} is {getattr(spec, field.name)!r:.40}")
             if spec.format != FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
@@ -169,11 +166,7 @@ def _is_named(scan: Any) -> bool:
 
 
 class _RemoteBytes:
-    """A file in a store that fsspec knows, such as an S3 bucket.
-
-    Raises:
-        DataError: there is no such file, or the store does not answer, or not to this user.
-    """
+    """A file in a store that fsspec knows, such as an S3 bucket."""
 
     def __init__(self, files: Any, path: str, url: str) -> None:
         self._files, self._path, self._url = files, path, url
@@ -272,7 +265,7 @@ class PreparedImages:
             "allowed: bright in one is dark in another; write it as numbers from 0 to 1",
         )
 
-    def evenly_spaced(self, count: int) -> PreparedImages:
+    def evenly_spaced(self, count: int) -> "PreparedImages":
         """Return so many of the images, evenly spaced, without opening the folder again."""
         chosen, whole, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
         chosen._entries = [self._entries[index] for index in indices]
@@ -288,7 +281,6 @@ class PreparedImages:
         """Return the images with all fine columns of a sensor, which may be fewer than were prepared.
 
         Args:
-            sensor: sensor whose rays are wanted.
             variant: projection variant that is wanted. The reference's columns cannot be gathered into fewer: it rounds
                 points to the nearest column.
 

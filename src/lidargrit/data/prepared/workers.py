@@ -4,8 +4,6 @@ These are commands of their own and not a pool of multiprocessing: they need onl
 script needs no guard against being imported again, and they end when the caller dies.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import queue
@@ -55,7 +53,6 @@ def make_shard(
     """Project the scans of one shard; go on from what an interrupted process has kept of it.
 
     Args:
-        folder: prepared folder.
         spec: description of what the folder will hold.
         shard: number of the shard.
         dataset: source of the scans.

@@ -1,7 +1,5 @@
 """Sources of scans, by what a user types → one object with the kind, the data and the provenance of the source."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A source of scans → its first scan, and the sensor that its data set names."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

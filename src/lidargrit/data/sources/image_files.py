@@ -1,7 +1,5 @@
 """Range images that other programs saved as ``.npy``: one file, or a folder of nothing else → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -112,8 +110,6 @@ def image_files(path: Path) -> list[Path]:
 
 
 class _ImageFiles:
-    """Files of range images as a store of images."""
-
     def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
         self._paths, self._sensor = paths, sensor
         self.provenance = Provenance(tuple(str(path.absolute()) for path in paths))

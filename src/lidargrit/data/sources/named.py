@@ -1,7 +1,5 @@
 """An opened source → its scans one after the other, each with the name of the file that is written for it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A folder of generated scans, one a file → their range images, and what it says of their model."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -86,8 +84,6 @@ def is_sample_folder(folder: Path) -> bool:
 
 
 class _Files:
-    """Sample files as a store of images."""
-
     def __init__(self, paths: list[Path], sensor: SensorModel, model_and_sampling: str) -> None:
         self._paths, self._shape = paths, (sensor.height, sensor.width)
         self.provenance = Provenance(tuple(f"{model_and_sampling}/sample {path.stem}" for path in paths))

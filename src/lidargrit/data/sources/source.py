@@ -1,7 +1,5 @@
 """What every source of scans or images answers, whatever its kind."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import ClassVar

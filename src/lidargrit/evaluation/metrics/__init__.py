@@ -1,7 +1,5 @@
 """Two sets of range images → a number; one metric = one file, which knows no generator and no global random state."""
 
-from __future__ import annotations
-
 import math
 import re
 from abc import ABC, abstractmethod
@@ -62,7 +60,7 @@ class ImageKind(NamedTuple):
     range_max_m: float
 
     @classmethod
-    def of(cls, sensor: SensorModel) -> ImageKind:
+    def of(cls, sensor: SensorModel) -> "ImageKind":
         """Return the kind of a sensor's images."""
         return cls(sensor.height, sensor.width, sensor.range_min_m, sensor.range_max_m)
 
@@ -182,7 +180,7 @@ class Metric(ABC, Generic[Features, Kept]):
         return MetricResult(self.name, value, self.higher_is_better, *counts, self.variant, details)
 
     @final
-    def merge(self, other: Metric[Features, Kept]) -> None:
+    def merge(self, other: "Metric[Features, Kept]") -> None:
         """Take in what another process has kept, as if its images had been fed here after ours.
 
         Raises:
@@ -201,7 +199,7 @@ class Metric(ABC, Generic[Features, Kept]):
         """Return what has been kept of one set."""
         return self._kept[real].value()
 
-    def choose_as(self, whole: Metric[Features, Kept]) -> None:
+    def choose_as(self, whole: "Metric[Features, Kept]") -> None:
         """Make the choices that depend on the size of the sets, if any, as a metric of larger ones makes them.
 
         A score of half of the scans then is of the same statistic as that of all.
@@ -221,7 +219,7 @@ class Metric(ABC, Generic[Features, Kept]):
             first.merge(other)
         vars(self).update(vars(first))
 
-    def require_same_options(self, other: Metric[Features, Kept]) -> None:
+    def require_same_options(self, other: "Metric[Features, Kept]") -> None:
         """Refuse to merge with a metric of another kind, variant or seed."""
         mine, theirs = ((metric.name, metric.variant, metric.seed) for metric in (self, other))
         if mine != theirs:

@@ -1,7 +1,5 @@
 """Where points lie, seen from above, over a whole set: two sets → Jensen-Shannon distance of their 1.6 m cells."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -31,7 +29,6 @@ class BevJsd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
             these programs, which place points on a border differently; besides, ``r2dm`` leaves out returns beyond
             63 m, and ``lidargen`` moves them to 63 m, where its encoding ends. Divergences are in double precision
             throughout (R2DM's are in single).
-        seed: not used.
 
     Source:
         Zyrianov et al., LiDARGen, ECCV 2022; hamedhaghighi/LidarGRIT@a3f86e7, kazuto1011/r2dm@ad66e71,

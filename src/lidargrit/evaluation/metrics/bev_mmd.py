@@ -1,7 +1,5 @@
 """Where points lie, seen from above, scan by scan: two sets → maximum mean discrepancy of their 1.6 m cells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -39,7 +37,6 @@ class BevMmd(Metric[Int64[np.ndarray, "B cells"], np.ndarray]):
             any other variant, and slow (a third of a millisecond for a pair of scans: hours for 5,000 of each).
             The histograms of each are those of ``bev_jsd``. All are in double precision (R2DM's is in single, where a
             number of 1e-4 has three digits).
-        seed: not used.
 
     Source:
         Gretton et al., A kernel two-sample test, JMLR 13, 2012, lemma 6 (unbiased: eq. 3, biased: eq. 5); programs as

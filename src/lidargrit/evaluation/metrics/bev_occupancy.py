@@ -1,7 +1,5 @@
 """How often each square metre seen from above holds a return: two sets → Jensen-Shannon distance, mean over cells."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Int64

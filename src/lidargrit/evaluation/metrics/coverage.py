@@ -1,7 +1,5 @@
 """Coverage (COV): the share of real clouds that are the nearest to some generated one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,6 @@ class Coverage(CloudMetric):
 
     Args:
         variant: published way to sample points from a scan, see :class:`CloudMetric`.
-        seed: not used.
 
     Source:
         Achlioptas et al., Learning representations and generative models for 3D point clouds, ICML 2018;

@@ -1,7 +1,5 @@
 """How often the neighbour of a drop drops too, at several lags: two sets → Jensen-Shannon distance, mean over lags."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64, Int64
 

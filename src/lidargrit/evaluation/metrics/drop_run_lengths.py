@@ -1,7 +1,5 @@
 """Lengths of the runs of dropped pixels along rows: two sets → Jensen-Shannon distance of their distributions."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64

@@ -1,7 +1,5 @@
 """Share of neighbours in a row that lie on two surfaces, by range: two sets → Jensen-Shannon distance."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor

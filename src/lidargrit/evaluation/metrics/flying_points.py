@@ -1,7 +1,5 @@
 """Share of returns in mid-air between two surfaces at an edge: two sets → Jensen-Shannon distance over gap widths."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -55,7 +53,6 @@ def extended_surface(images: RangeImage, side: int) -> Float[Tensor, "B H W"]:
     """Return the range at which the ray of each pixel meets the surface of its two neighbours on one side.
 
     Args:
-        images: a batch of range images.
         side: 1 for the neighbours on the left, -1 for those on the right.
 
     Returns:

@@ -1,7 +1,5 @@
 """Fréchet distance between the features that PointNet finds in two sets of clouds (FPD): two sets → a number."""
 
-from __future__ import annotations
-
 from lidargrit.evaluation.metrics.shared.networks.frechet import FrechetMetric
 
 

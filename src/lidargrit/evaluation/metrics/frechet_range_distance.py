@@ -1,7 +1,5 @@
 """Fréchet distance between the features that RangeNet++ finds in two sets of images (FRD): two sets → a number."""
 
-from __future__ import annotations
-
 from lidargrit.evaluation.metrics.shared.networks.frechet import FrechetMetric
 
 

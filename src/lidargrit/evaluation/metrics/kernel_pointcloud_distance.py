@@ -1,7 +1,5 @@
 """Kernel distance between the features that PointNet finds in two sets of clouds (KPD): two sets → a number."""
 
-from __future__ import annotations
-
 from lidargrit.evaluation.metrics.shared.networks.kernel import KernelMetric
 
 

@@ -1,7 +1,5 @@
 """Kernel distance between the features that RangeNet++ finds in two sets of range images: two sets → a number."""
 
-from __future__ import annotations
-
 from lidargrit.evaluation.metrics.shared.networks.kernel import KernelMetric
 
 

@@ -1,7 +1,5 @@
 """Which 5 cm cells, seen from above, hold points: two sets → Jensen-Shannon distance, as LiDM's toolbox has it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -32,7 +30,6 @@ class LidmBevJsd(ImageMetric):
     Args:
         variant: ``exact`` only. The toolbox divides by the width of a cell in single precision: points on the border
             of two cells may fall into the other one.
-        seed: not used.
 
     Source:
         Ran et al., Towards realistic scene generation with LiDAR diffusion models, CVPR 2024; cells of

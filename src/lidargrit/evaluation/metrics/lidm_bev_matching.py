@@ -1,7 +1,5 @@
 """Which 0.5 m cells, seen from above, hold points: two sets → minimum matching distance, LiDM's "MMD"."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -33,7 +31,6 @@ class LidmBevMatching(ImageMetric):
 
     Args:
         variant: ``exact`` only; the toolbox computes the same in single precision.
-        seed: not used.
 
     Source:
         Ran et al., Towards realistic scene generation with LiDAR diffusion models, CVPR 2024; cells and

@@ -1,7 +1,5 @@
 """How near generated clouds come to each real one: two sets → mean Chamfer distance of the nearest, the paper's MD."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from lidargrit.evaluation.metrics.shared.clouds import CloudMetric
@@ -21,7 +19,6 @@ class MinimumMatchingDistance(CloudMetric):
 
     Args:
         variant: published way to sample points from a scan, see :class:`CloudMetric`.
-        seed: not used.
 
     Source:
         Achlioptas et al., Learning representations and generative models for 3D point clouds, ICML 2018;

@@ -1,7 +1,5 @@
 """Accuracy of the nearest neighbour (1-NNA) at telling generated clouds from real ones; 0.5 is the best."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,6 @@ class OneNearestNeighbour(CloudMetric):
 
     Args:
         variant: published way to sample points from a scan, see :class:`CloudMetric`.
-        seed: not used.
 
     Source:
         Lopez-Paz and Oquab, Revisiting classifier two-sample tests, ICLR 2017; Yang et al., PointFlow, ICCV 2019;

@@ -1,7 +1,5 @@
 """Where points lie in space, over a whole set: two sets → 3-D Jensen-Shannon divergence in a ball of grid points."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any, ClassVar
 
@@ -28,7 +26,6 @@ class PointCloudJsd(CloudMetric):
         variant: published way to sample points from a scan, see :class:`CloudMetric`. Besides, ``reference`` adds
             1e-8 to every share of either set, and once more to their mean, as LidarGRIT's program does: a set against
             itself then gives about 0.0024 instead of 0.
-        seed: not used.
 
     Source:
         Achlioptas et al., Learning representations and generative models for 3D point clouds, ICML 2018;

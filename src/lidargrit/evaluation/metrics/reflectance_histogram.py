@@ -1,7 +1,5 @@
 """Distribution of reflectance over the returns: two sets that have it → Jensen-Shannon distance."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Int64

@@ -1,7 +1,5 @@
 """Share of rays that return against the angle at which they should strike: two sets → Jensen-Shannon distance."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64, Int64
 

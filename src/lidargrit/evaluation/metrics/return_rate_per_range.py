@@ -1,7 +1,5 @@
 """Share of rays that return against the range of what they should meet: two sets → Jensen-Shannon distance."""
 
-from __future__ import annotations
-
 from jaxtyping import Bool, Float
 from torch import Tensor
 

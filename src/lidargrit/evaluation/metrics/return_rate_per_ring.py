@@ -1,7 +1,5 @@
 """Share of rays that return, row by row: two sets → Jensen-Shannon distance, the root of the mean over rows."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64, Int64
 

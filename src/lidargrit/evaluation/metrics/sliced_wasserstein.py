@@ -1,7 +1,5 @@
 """Sliced Wasserstein distance between local patches of range images, scale by scale: two sets → mean over scales."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from typing import Any, ClassVar, Literal
@@ -118,7 +116,7 @@ class SlicedWasserstein(ImageMetric):
     def _patches_per_level(self) -> list[int]:
         return [_PATCHES if self.variant == "textbook" else min(_PATCHES, size) for size in self._level_sizes()]
 
-    def _shared_positions(self) -> SharedPositions:
+    def _shared_positions(self) -> "SharedPositions":
         if self._shared is None:
             self._shared = SharedPositions(self.seed, self._level_sizes())
         return self._shared

@@ -1,7 +1,5 @@
 """Share of returns from objects one pixel wide, by the range behind them: two sets → Jensen-Shannon distance."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor

@@ -1,7 +1,5 @@
 """How far neighbouring returns on walls lie off a straight line: two sets → Jensen-Shannon distance of histograms."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64

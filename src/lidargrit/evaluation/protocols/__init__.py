@@ -1,7 +1,5 @@
 """The name of a protocol → the metrics that it asks for, and the images on which it computes them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from lidargrit.core import discovery

@@ -1,7 +1,5 @@
 """What a generator is told of training scans: the name of a kind, as in ``data.condition=NAME`` → how scans tell it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
@@ -19,9 +17,6 @@ class ToldOfScans(ABC):
     @abstractmethod
     def of(self, images: RangeImage) -> Condition:
         """Return what a generator is told of each image.
-
-        Args:
-            images: batch of range images (B, H, W), as they are learned from.
 
         Raises:
             ConfigError: images that lack what tells it.

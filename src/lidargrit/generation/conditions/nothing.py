@@ -1,7 +1,5 @@
 """Nothing: a generator learns all scans alike and samples new ones by their seeds alone."""
 
-from __future__ import annotations
-
 from lidargrit.generation.conditions import ToldOfScans
 from lidargrit.scans.condition import NOTHING, Nothing
 from lidargrit.scans.types import RangeImage

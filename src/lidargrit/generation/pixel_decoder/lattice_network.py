@@ -1,7 +1,5 @@
 """The convolutional network that a pixel decoder runs for the phases of one lattice of pixels."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """Random numbers of a mask's pixels: independent ones → ones that are alike where pixels of one phase lie close."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

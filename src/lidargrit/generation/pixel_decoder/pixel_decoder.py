@@ -1,7 +1,5 @@
 """Pixels generated in phases from coarse to fine, with exact probabilities: output of a decoder → range images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -103,8 +101,6 @@ class PixelDecoder(nn.Module):
     for the noise that their masks may share (:class:`PhaseNoise`).
 
     Args:
-        config: sizes of the networks.
-        sensor: sensor with the rays and limits of the range images.
         features: number of channels of the tokenizer's features; 0 for a decoder without a tokenizer.
         components: number of components of the distribution of a range that the tokenizer decodes.
 
@@ -238,7 +234,6 @@ class PixelDecoder(nn.Module):
 
         Args:
             decoded: output of the tokenizer's decoder for as many scans; None without a tokenizer.
-            rngs: random generators on the CPU, one for each scan.
             sampling: settings of the sampling of masks and ranges.
             condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
                 are when their phase comes: later phases know of them, earlier ones do not.

@@ -1,7 +1,5 @@
 """The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -113,14 +111,14 @@ class Guide(NamedTuple):
     observed: Bool[Tensor, "B H W"] | None = None
     components: Float[Tensor, "B 3 K H W"] | None = None
 
-    def part(self, some: slice) -> Guide:
+    def part(self, some: slice) -> "Guide":
         """Return the guide of some of the scans."""
         observed = None if self.observed is None else self.observed[some]
         components = None if self.components is None else self.components[some]
         return Guide(self.features[some], self.v[some], self.return_logits[some], observed, components)
 
     @classmethod
-    def of(cls, decoded: Decoded) -> Guide:
+    def of(cls, decoded: Decoded) -> "Guide":
         """Return the guide from the output of the tokenizer's decoder.
 
         Raises:
@@ -140,7 +138,7 @@ class Guide(NamedTuple):
         return cls(at_least_32_bits(decoded.features), v, logits, components=at_least_32_bits(components))
 
     @classmethod
-    def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> Guide:
+    def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> "Guide":
         """Return the guide of scans of which no token tells anything, as numbers of the type of another tensor."""
         size = (count, sensor.height, sensor.width)
         return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, TYPICAL_LOG_RANGE), like.new_zeros(size))
@@ -224,14 +222,13 @@ class MaskNetwork(PhaseNetwork):
         self.noise = PhaseNoise(self.phases)
 
     @classmethod
-    def behind(cls, features: int, width: int, sensor: SensorModel) -> MaskNetwork:
+    def behind(cls, features: int, width: int, sensor: SensorModel) -> "MaskNetwork":
         """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
         it sees.
 
         Args:
             features: channels of the other network's features.
             width: channels of the layers.
-            sensor: the rays of the range images.
         """
         return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
 

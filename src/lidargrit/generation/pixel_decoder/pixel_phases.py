@@ -1,7 +1,5 @@
 """The order in which a pixel decoder generates pixels, from coarse to fine: size of a cell → phases, neighbours."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 

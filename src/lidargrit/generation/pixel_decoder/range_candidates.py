@@ -1,7 +1,5 @@
 """Ranges that pixels of earlier phases suggest for those of a phase: neighbours, and surfaces through neighbours."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -49,7 +47,6 @@ class RangeCandidates(nn.Module):
     bracket it.
 
     Args:
-        sensor: rays of the range images.
         phases: all phases of the pixel decoder.
         surfaces: whether planes and lines are among the candidates.
         gravity: whether vertical and horizontal planes are among the candidates.

@@ -1,7 +1,5 @@
 """A mixture of logistic distributions of a range, cut off at the sensor's limits: numbers → density, random ranges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -45,7 +43,7 @@ class RangeMixture:
     log_scales: Float[Tensor, "*P K"]
     limits_m: tuple[float, float]
 
-    def at(self, pixels: Bool[Tensor, "*P"]) -> RangeMixture:
+    def at(self, pixels: Bool[Tensor, "*P"]) -> "RangeMixture":
         """Return the distributions of some pixels, one after the other."""
         return RangeMixture(self.logits[pixels], self.centres[pixels], self.log_scales[pixels], self.limits_m)
 

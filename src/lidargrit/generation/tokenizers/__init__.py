@@ -1,7 +1,5 @@
 """The contract of a tokenizer, which turns range images into tokens and back, and how a configuration names it."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -69,7 +67,7 @@ class Tokenizer(Objective, Generic[Config]):
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
 
-    def for_decoding(self, precision: Precision) -> Tokenizer[Config]:
+    def for_decoding(self, precision: Precision) -> "Tokenizer[Config]":
         """Return a tokenizer with the same weights that only decodes, perhaps quicker or in 16 bits."""
         return self
 

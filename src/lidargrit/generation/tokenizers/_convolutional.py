@@ -1,7 +1,5 @@
 """Base of the VQ-VAEs: checks of sizes, levels of residual blocks, encoder, decoder and codebook."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterable
 

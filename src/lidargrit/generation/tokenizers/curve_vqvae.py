@@ -1,7 +1,5 @@
 """LiDM's first stage, a VQ-VAE whose finest levels shorten the rows alone, curve by curve."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -93,7 +91,6 @@ class CurveVqvaeConfig(TokenizerConfig):
 
 
 def _level(inputs: int, width: int, num_blocks: int, kernel: tuple[int, int], norm_groups: int) -> Level:
-    """Make residual blocks with one kernel."""
     widths = [inputs, *[width] * num_blocks]
     return Level([ResidualBlock(*pair, 0.0, "wrap", kernel, norm_groups) for pair in pairwise(widths)])
 
@@ -185,10 +182,6 @@ class CurveVqvae(ConvolutionalTokenizer[CurveVqvaeConfig]):
 
     Its discriminator is left out, whose weight is 0 after the first two steps because the program's condition is
     inverted, and so are its terms of geometry and of perception, which are off in the published configuration.
-
-    Args:
-        config: sizes and losses.
-        sensor: sensor with the rays and limits of its range images.
 
     Raises:
         ConfigError: the image's rows or columns cannot be divided as often as the strides say.

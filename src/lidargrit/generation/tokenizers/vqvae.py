@@ -1,7 +1,5 @@
 """The paper's first stage, a VQ-VAE whose decoder gives a clean range and, apart from it, the raydrop."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections import OrderedDict
@@ -184,7 +182,7 @@ class Decoder(ConvolutionalDecoder):
         self.norm_out = group_norm(widths[0])
         self.conv_out = Convolution(widths[0], 1 + c.raydrop_loss + c.reflectance, c.padding)
 
-    def prepared(self, precision: Precision) -> Decoder:
+    def prepared(self, precision: Precision) -> "Decoder":
         """Return a copy for decoding only, quicker: channels last, upsampling folded, perhaps in 16 bits.
 
         The last layers stay in 32 bits: 16 would leave 8 of them for a range, steps of 0.2 m at 80 m.
@@ -204,10 +202,6 @@ class Decoder(ConvolutionalDecoder):
 
 class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
     """The adapted VQ-VAE of LidarGRIT.
-
-    Args:
-        config: sizes and losses.
-        sensor: sensor with the rays and limits of its range images.
 
     Raises:
         ConfigError: the image's rows or columns cannot be halved at every level.
@@ -251,7 +245,7 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         encoded, return_logits, reflectance = self._heads(self.decoder.conv_out(features))
         return Decoded(self.range_encoding.decode(encoded), return_logits, self.sensor, reflectance, features)
 
-    def for_decoding(self, precision: Precision) -> Vqvae:
+    def for_decoding(self, precision: Precision) -> "Vqvae":
         """Return a tokenizer with the same weights that only decodes, quicker; see :meth:`Decoder.prepared`."""
         fast = copy.copy(self)
         fast._modules = {**self._modules, "decoder": self.decoder.prepared(precision)}
@@ -357,7 +351,6 @@ def upright_and_thin(range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, 
     of the first. Ranges are the same within 5 %.
 
     Args:
-        range_m: ranges in metres.
         return_mask: pixels with a return; others are at no range.
     """
     v = torch.where(return_mask, range_m.clamp(min=1e-3).log(), -99.0)

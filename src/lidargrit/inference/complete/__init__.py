@@ -1,7 +1,5 @@
 """What completes scans: the name of a run or of a classical method → a generator, with the settings it completes by."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -79,7 +77,6 @@ def open_model(
         kind: kind of the conditions that it will be given.
         sensor: sensor of the scans, which a classical method needs; a run has its own.
         settings: settings of the run's sampling, as NAME=VALUE.
-        device: device to compute on; a GPU if there is one and none is named.
 
     Raises:
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
@@ -127,7 +124,6 @@ def open_models(words: Sequence[str], sensor: SensorModel | None = None, device:
         words: models and methods, each as in :func:`open_model`; a run may bring settings, as in
             ``runs/mine:temperature=0.9``.
         sensor: sensor of the scans; needed only where there is no run among the words.
-        device: device to compute on.
     """
     runs: dict[str, Model] = {}
     for word in words:

@@ -1,7 +1,5 @@
 """A cloud and what a model made of its images → the whole cloud: measured points as they are, then filled ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Completed clouds → files: in a scan's own format with all that its file holds of every point, or in another one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The verbs complete, upsample and raydrop: a source, a model, a task and a folder → files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lidargrit.core.reporting import Reporter
@@ -30,7 +28,6 @@ def complete_scans(
         task: what is done with each scan.
         output: number and kind of files.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        reporter: receiver of progress and messages.
 
     Returns:
         what was written, and how many points came in and went out.

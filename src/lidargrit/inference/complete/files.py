@@ -1,7 +1,5 @@
 """Scans of a user → their completions in files, which have the names of the scans."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -105,12 +103,10 @@ def write_completions(
     Args:
         inputs: scans of the user.
         out: an empty folder, or one that the same command began.
-        model: model or classical method.
         task: what is done with each scan.
         output: number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
-        reporter: receiver of progress and messages.
 
     Raises:
         ConfigError: several completions by what completes a scan in one way.

@@ -1,7 +1,5 @@
 """The rays of a whole cloud as images of a model: one for every column at which the model's columns may begin."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -39,7 +37,7 @@ class RayGrid:
     phases: int = 1
 
     @classmethod
-    def fitting(cls, model: SensorModel, columns: int, first_edge_rad: float | None = None) -> RayGrid:
+    def fitting(cls, model: SensorModel, columns: int, first_edge_rad: float | None = None) -> "RayGrid":
         """Return the grid with about as many columns as a cloud has, and at most as many.
 
         Args:

@@ -1,7 +1,5 @@
 """A user's scans → range images on the grid of a sensor, and the points that lie in their pixels."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -60,7 +58,7 @@ class InputScan:
         return self.grid or RayGrid(self.image.sensor, self.image.sensor)
 
     @classmethod
-    def of_image(cls, image: RangeImage) -> InputScan:
+    def of_image(cls, image: RangeImage) -> "InputScan":
         """Return a range image as a scan of points, one on the ray of each return."""
         row, column = (part.numpy() for part in image.return_mask.nonzero(as_tuple=True))
         range_m = image.range_m[image.return_mask].numpy()
@@ -91,12 +89,11 @@ class Inputs:
     """The scans of a source, one after the other.
 
     Args:
-        scans: scans of the source.
         reader: projection of points to range images.
         reporter: receiver of how many points of the first scan have a pixel, and of the first doubt about the sensor.
     """
 
-    def __init__(self, scans: PointScans | ImageScans, reader: ScanReader, reporter: Reporter) -> None:
+    def __init__(self, scans: PointScans | ImageScans, reader: "ScanReader", reporter: Reporter) -> None:
         self._scans, self._reader, self._reporter = scans, reader, reporter
         self._counted = self._doubted = False
 
@@ -158,7 +155,6 @@ class ScanReader:
     """How points become a range image.
 
     Args:
-        sensor: sensor of the image.
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
         few_rings_cure: what to do with a scan of far fewer rows.
@@ -211,7 +207,6 @@ def images_for(models: Sequence[Model], source: str, settings: ScanSettings, rep
 
     Args:
         models: models and classical methods.
-        source: name of the scans.
         settings: settings of reading and projecting them.
         reporter: receiver of progress and of the warning.
     """

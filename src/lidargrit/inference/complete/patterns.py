@@ -1,7 +1,5 @@
 """Which pixels of a scan are taken as observed: words such as rows:4, or a file → a mask."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,7 +61,6 @@ class Pattern:
         Args:
             images: batch of range images of one scan.
             seed: seed of the pixels that ``pixels:SHARE`` chooses; each further image has others.
-            source: name of the scan, for messages.
 
         Raises:
             UsageError: a mask of another size, or one by which all pixels are observed.
@@ -99,11 +96,7 @@ class Pattern:
         return _read_mask(Path(self.text), (height, width))
 
     def _numbers(self) -> list[float]:
-        """Return the numbers behind the colon.
-
-        Raises:
-            UsageError: other words, or numbers out of their bounds.
-        """
+        """Return the numbers behind the colon."""
         name, _, rest = self.text.partition(":")
         wanted, count = {
             "rows": ("rows:N with a whole N from 2 to 64", 1),

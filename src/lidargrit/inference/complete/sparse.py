@@ -1,7 +1,5 @@
 """Scans of a sensor with few rows → observed rows on the grid of a sensor with more rows."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

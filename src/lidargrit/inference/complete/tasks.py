@@ -1,7 +1,5 @@
 """What a model can do with a scan: fill it in, add rows between its own, or drop returns of a clean one."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar

@@ -7,8 +7,6 @@ scans lie without gaps, and one that was left out has no bytes. A file that was 
 altered, is refused.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import struct
@@ -42,7 +40,6 @@ class Entry(NamedTuple):
     """A line of the index.
 
     Args:
-        name: name of the scan.
         length: number of bytes of the scan; 0 for one that was left out.
         crc32: CRC-32 checksum of these bytes.
         num_returns: number of returns of the scan.
@@ -54,7 +51,7 @@ class Entry(NamedTuple):
     num_returns: int
 
     @classmethod
-    def of(cls, facts: Sequence[Any]) -> Entry:
+    def of(cls, facts: Sequence[Any]) -> "Entry":
         """Check the facts of a line; raises TypeError or ValueError if they are none."""
         name, length, crc32, num_returns = facts
         if not (isinstance(name, str) and all(isinstance(each, int) for each in (length, crc32, num_returns))):
@@ -65,13 +62,12 @@ class Entry(NamedTuple):
 
 
 @contextmanager
-def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = None) -> Iterator[ArchiveWriter]:
+def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = None) -> "Iterator[ArchiveWriter]":
     """Give a writer of a file that appears when the block has ended well; if it was interrupted, the next goes on.
 
     Until then scans lie in a folder beside the file, named as the file with ``.unfinished``.
 
     Args:
-        path: file to write.
         header: facts that all scans have in common, as JSON.
         chosen: options that say which scans these are, as JSON, to be kept beside an unfinished file.
 
@@ -214,9 +210,6 @@ class ArchiveWriter:
 
 class Archive:
     """A file of compressed scans, whose index is read at once and whose scans are read when they are asked for.
-
-    Args:
-        path: path of the file.
 
     Attributes:
         index_crc32: checksum of the index, which tells two files of scans with the same names apart.

@@ -5,8 +5,6 @@ results of single additions, multiplications and divisions, and of scaling by po
 operation on an array, so that no compiler can join two of them.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

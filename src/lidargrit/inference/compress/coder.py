@@ -1,7 +1,5 @@
 """Decisions with known probabilities ⇄ 32-bit words: a range coder, and how integers become decisions."""
 
-from __future__ import annotations
-
 import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable

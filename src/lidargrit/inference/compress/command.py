@@ -1,7 +1,5 @@
 """A source of scans → one file of compressed range images, and back into a file for each scan."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,9 +52,7 @@ def compress_scans(
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
-        step_mm: step in millimetres that ranges are rounded to.
         config: number of scans, and what to do with unusable points and scans.
-        reporter: receiver of progress and messages.
 
     Raises:
         ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
@@ -106,7 +102,6 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         model: run by which it was compressed.
         kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
         chosen: indices of the scans that are wanted; all if there is none.
-        reporter: receiver of progress.
 
     Raises:
         ScanError: a file that was cut off or altered, or that this machine cannot reproduce.

@@ -1,7 +1,5 @@
 """64-bit outputs of networks → integers that are the same on every machine, although the last bits differ."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

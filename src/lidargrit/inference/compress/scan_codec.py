@@ -1,7 +1,5 @@
 """One range image ⇄ bytes, by a generator with a pixel decoder."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json
@@ -53,7 +51,6 @@ class ScanCodec:
 
     Args:
         generator: generator with a pixel decoder.
-        step_mm: step of the ranges in whole millimetres.
 
     Raises:
         ConfigError: a generator without a pixel decoder, a step that is not one, or no range coder.

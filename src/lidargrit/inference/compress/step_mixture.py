@@ -1,7 +1,5 @@
 """Rounded parameters of a mixture of logistics → its distribution function at the borders of steps, bit for bit."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64, Int64
 

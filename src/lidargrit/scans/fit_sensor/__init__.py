@@ -1,7 +1,5 @@
 """Scans of an unknown sensor → its :class:`SensorModel`, with the evidence for and against the fit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Points and their rings → the step between firings, columns of a revolution, azimuth offset of each laser."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Points and their rings → the elevation of every row, or the rows themselves where rings are not known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

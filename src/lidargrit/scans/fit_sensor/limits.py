@@ -1,7 +1,5 @@
 """Points → the range limits of a sensor, and the step in which it counts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Points in polar coordinates: :class:`Scan` → range, elevation and azimuth of every point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,7 +38,7 @@ class Points:
         return len(self.range_m)
 
     @classmethod
-    def of_scan(cls, scan: Scan) -> Points:
+    def of_scan(cls, scan: Scan) -> "Points":
         """Return the points of a scan, or refuse one that cannot show its sensor.
 
         Raises:

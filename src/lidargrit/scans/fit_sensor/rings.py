@@ -1,7 +1,5 @@
 """The laser of each point: scans → ring numbers, by a field of the files or by the order of their points."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A :class:`SensorFit` → a table of the fitted sensor and the quality of the fit, or the same as plain values."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Encoding of ranges for networks: metres ⇄ [-1, 1], with -1 for no return."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Literal

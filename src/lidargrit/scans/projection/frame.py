@@ -1,7 +1,5 @@
 """Whether points are in the frame of the sensor that saw them: coordinates of maps, of cars, and in other units."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidargrit.core.errors import ScanError

@@ -1,7 +1,5 @@
 """Scan → range image, by spherical projection or by scan unfolding."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32

@@ -1,7 +1,5 @@
 """Losses and errors of a projection: scan, sensor → :class:`Inspection`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -51,7 +49,6 @@ class Inspection:
 
     Args:
         scan: scan that was projected.
-        sensor: sensor whose rays the image has.
         method: projection method, ``spherical`` or ``unfolding``.
         variant: variant of the projection, ``exact`` or ``reference``.
         fate: index into FATES (n,) of every point.

@@ -1,7 +1,5 @@
 """Points of a scan → their row, column and range in the image, and the nearest point of each pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

@@ -1,7 +1,5 @@
 """How many revolutions of its sensor a scan holds, by the order of its points."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

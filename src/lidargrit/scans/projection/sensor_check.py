@@ -1,7 +1,5 @@
 """Whether a scan fits a sensor: scan, sensor → problems, the projection that fits, and the sensors that would fit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

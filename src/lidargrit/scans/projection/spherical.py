@@ -1,7 +1,5 @@
 """Spherical projection: points → the row of their elevation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scan unfolding: points in firing order → the row of their ring and the column of their azimuth."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int32

@@ -1,7 +1,5 @@
 """Range image → points, each on its pixel's ray."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

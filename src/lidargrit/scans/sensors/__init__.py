@@ -1,7 +1,5 @@
 """Sensors, by name or from a file: tables of ray directions and range limits → :class:`SensorModel`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
@@ -88,7 +86,7 @@ class SensorModel:
         horizontal = elevation.cos()
         return torch.stack((horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()), dim=-1)
 
-    def with_columns(self, columns: int, stride: int = 1) -> SensorModel:
+    def with_columns(self, columns: int, stride: int = 1) -> "SensorModel":
         """Return this sensor with ``columns // stride`` columns: every ``stride``-th of ``columns`` equal ones.
 
         The azimuth of a kept column is that of its own centre, first_edge_rad - 2 pi (stride j + 1/2) / columns. Where
@@ -113,7 +111,7 @@ class SensorModel:
         azimuth_rad = column_azimuths_rad(columns, stride, edge_rad)
         return replace(self, azimuth_rad=azimuth_rad, column_stride=stride, first_edge_rad=edge_rad)
 
-    def fine(self) -> SensorModel:
+    def fine(self) -> "SensorModel":
         """Return this sensor with every fine column that it fires."""
         return self if self.column_stride == 1 else self.with_columns(self.width * self.column_stride)
 
@@ -136,7 +134,7 @@ class SensorModel:
         return data
 
     @classmethod
-    def from_json(cls, data: Any) -> SensorModel:
+    def from_json(cls, data: Any) -> "SensorModel":
         """Rebuild a sensor from what :meth:`to_json` returned, or someone wrote by hand.
 
         Raises:
@@ -144,7 +142,7 @@ class SensorModel:
         """
         return cls(**checked_entries(data, get_args(ProjectionName)))
 
-    def same_rays(self, other: SensorModel) -> bool:
+    def same_rays(self, other: "SensorModel") -> bool:
         """Return whether two sensors look along the same rays, within a hundredth of a degree."""
         if (self.height, self.width) != (other.height, other.width):
             return False

@@ -1,7 +1,5 @@
 """Checks of a sensor's tables and limits, from code or from an untrusted JSON file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

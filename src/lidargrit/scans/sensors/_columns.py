@@ -1,7 +1,5 @@
 """Azimuths of columns: of the centres of a number of equal ones, and the means of a table of all pixels."""
 
-from __future__ import annotations
-
 import math
 
 import torch

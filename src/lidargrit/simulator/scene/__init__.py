@@ -1,7 +1,5 @@
 """A street scene: random numbers → triangles around a car with a sensor, at any time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import get_args
 
@@ -78,7 +76,6 @@ def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
     """Sample a street scene; the same state of the generator gives the same scene, bit for bit.
 
     Args:
-        rng: source of all random numbers.
         theme: dense city, suburb with gardens, open country, or mixed: chosen at random, mostly suburb and city.
 
     Raises:

@@ -1,7 +1,5 @@
 """Houses: positions and sizes → walls with windows, doors, balconies, roofs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Positions of everything but houses: a plan and its houses → gardens, trees, street furniture, traffic, people."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidargrit.simulator.scene import plants, street_furniture

@@ -1,7 +1,5 @@
 """Objects that stand or move: shapes in their own frames, and poses → triangles at a time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -40,17 +38,17 @@ class Placements:
         speed_m_s: float | Num[np.ndarray, " n"] = 0.0,
         across: bool = False,
         rise_m: float | Num[np.ndarray, " n"] = 0.0,
-    ) -> Placements:
+    ) -> "Placements":
         """Make placements from arrays, or from numbers that are the same for all."""
         u, v, turn, speed, rise = (np.full(len(u_m), a, np.float64) for a in (u_m, v_m, turn_rad, speed_m_s, rise_m))
         return cls(u, v, turn, speed, np.full(len(u), across), rise)
 
     @classmethod
-    def join(cls, placements: list[Placements]) -> Placements:
+    def join(cls, placements: "list[Placements]") -> "Placements":
         """Join several placements into one."""
         return cls(*(np.concatenate([getattr(s, f.name) for s in placements]) for f in fields(cls)))
 
-    def select(self, which: Shaped[np.ndarray, " m"]) -> Placements:
+    def select(self, which: Shaped[np.ndarray, " m"]) -> "Placements":
         """Return some of them, by index or by truth."""
         return Placements(*(getattr(self, f.name)[which] for f in fields(self)))
 
@@ -93,12 +91,12 @@ class ObjectBatch:
         local = poses.to_world(self.local_m, lean=True)
         builder.add(local, self.material, self.albedo, self.label, self.instance[:, None])
 
-    def split(self) -> tuple[ObjectBatch, ObjectBatch]:
+    def split(self) -> "tuple[ObjectBatch, ObjectBatch]":
         """Return those that stand and those that move."""
         moves = self.placements.speed_m_s != 0
         return self._select(np.flatnonzero(~moves)), self._select(np.flatnonzero(moves))
 
-    def _select(self, which: np.ndarray) -> ObjectBatch:
+    def _select(self, which: np.ndarray) -> "ObjectBatch":
         arrays = (self.local_m, self.material, self.albedo, self.label, self.instance)
         local, material, albedo, label, instance = (a[which] for a in arrays)
         return ObjectBatch(local, material, albedo, label, instance, self.placements.select(which))

@@ -1,7 +1,5 @@
 """People on foot and on bicycles: sizes and positions → limbs, wheels and frames."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidargrit.scans import labels

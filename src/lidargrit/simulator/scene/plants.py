@@ -1,7 +1,5 @@
 """Trees, bushes and hedges: positions and sizes → trunks and crowns of many small leaves that let beams through."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, Num
 

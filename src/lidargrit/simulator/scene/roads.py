@@ -1,7 +1,5 @@
 """The ground: a plan → roads, kerbs, pavements, gardens, fields, lane markings, and a bridge across."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Positions of houses: a plan → rows along the streets, garages, blocks behind, and the gaps between."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simple solids, many at once: arrays of sizes → arrays of triangles; a builder of them → a mesh."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Num
 

@@ -1,7 +1,5 @@
 """Street furniture: positions → walls, fences, guard rails, poles, lamps, signs, bins and cabinets."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, Num
 

@@ -4,8 +4,6 @@ Everything is laid out in street coordinates: u runs along our road, v to its le
 upright rectangles there; one smooth map bends them into the world.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -64,7 +62,7 @@ class Poses:
             out[..., 2] += slope[:, 0][spread] * x + slope[:, 1][spread] * y
         return out
 
-    def of(self, which: Shaped[np.ndarray, " m"]) -> Poses:
+    def of(self, which: Shaped[np.ndarray, " m"]) -> "Poses":
         """Return the poses of some, or of some several times over."""
         return Poses(self.xyz_m[which], self.yaw_rad[which], self.slope[which])
 

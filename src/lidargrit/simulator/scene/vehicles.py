@@ -1,7 +1,5 @@
 """Cars, vans and trucks: kinds and places → bodies lofted over cross-sections, with glass, wheels and plates."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float, Int
 

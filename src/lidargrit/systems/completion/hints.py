@@ -1,7 +1,5 @@
 """Observed pixels → maps for a network that completes scans, and ranges to choose from, by classical methods."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -49,7 +47,7 @@ class Hints(NamedTuple):
     labels: Int[Tensor, "B 5 H W"] | None = None
     reflectances: Float[Tensor, "B 6 H W"] | None = None
 
-    def mirrored(self) -> Hints:
+    def mirrored(self) -> "Hints":
         """Return the hints of the scans' mirror images, left and right exchanged."""
         maps = [_LEFT_RIGHT.get(index, index) for index in range(NUM_MAPS)]
         candidates = [_LEFT_RIGHT_CANDIDATES.get(index, index) for index in range(NUM_CANDIDATES)]

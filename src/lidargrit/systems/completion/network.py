@@ -1,7 +1,5 @@
 """A network that completes scans: observed pixels and classical fills → range, return, reflectance and class."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -100,10 +98,6 @@ class CompletionNetwork(nn.Module):
 
     Range and reflectance are point estimates, the best single guess, and no samples; the mask is sampled, each phase
     given the observed pixels and the earlier phases, so that drops cluster as real ones do.
-
-    Args:
-        config: sizes of the network.
-        sensor: sensor with the rays and limits of the range images.
     """
 
     def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
@@ -186,7 +180,6 @@ class CompletionNetwork(nn.Module):
 
         Args:
             condition: observed pixels of as many scans.
-            rngs: random generators on the CPU, one for each scan.
         """
         images, uniform = [], self.mask.uniform(rngs)
         for index in range(len(rngs)):

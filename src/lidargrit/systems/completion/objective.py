@@ -1,7 +1,5 @@
 """Objective of the completion network: whole scans, with random parts hidden → the terms of a loss."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -39,7 +37,6 @@ class CompletionObjective(Objective):
 
     Args:
         network: network that is trained.
-        sensor: sensor whose range images it completes.
     """
 
     additions = frozenset({"labels", "reflectance"})

@@ -1,7 +1,5 @@
 """A network that completes scans: observed pixels → range images, by triangulation and a U-Net."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import torch

@@ -1,7 +1,5 @@
 """The two networks of a GAN of range images, whose azimuth wraps: latents → images, images → logits of being real."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

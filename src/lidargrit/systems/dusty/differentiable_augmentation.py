@@ -1,7 +1,5 @@
 """Changes that a discriminator sees on real and generated images alike, so that it cannot learn scans by heart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Differentiable sampling of returns: logits of a return → 0 or 1 for each ray."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

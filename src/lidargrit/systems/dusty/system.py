@@ -1,7 +1,5 @@
 """DUSty: a GAN that generates a clean scan, then drops rays from it; seeds → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,7 +175,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         return Cost(1, flops_of(self.synthesis, (1, self.config.latent_dim)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: DustyConfig, sensor: SensorModel) -> Dusty:
+    def from_published(cls, files: Sequence[Path], config: DustyConfig, sensor: SensorModel) -> "Dusty":
         """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
         return load_published(files[0], sensor)
 

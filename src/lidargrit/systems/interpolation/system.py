@@ -1,7 +1,5 @@
 """Classical methods without weights: observed pixels → range images, by the nearest return, on lines or triangles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Range images ⇄ images of horizontal distance and height, which have some of the rows and no holes."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """LidarGAN's two convolutional networks, and the losses of GAN and VAE: latents → images, images → vectors."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """LidarGAN: a GAN of distance and height in 40 rows without holes; seeds → range images without raydrop."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,7 +130,7 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         return Cost(1, flops_of(self.decoder, (1, self.config.latent_dim)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarGanConfig, sensor: SensorModel) -> LidarGan:
+    def from_published(cls, files: Sequence[Path], config: LidarGanConfig, sensor: SensorModel) -> "LidarGan":
         """Make a generator of one file of weights, such as ``gen_999.pth``, which tells its own sizes.
 
         The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
@@ -141,7 +139,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         Args:
             files: file of the program; code in it is not run.
             config: rows of the image.
-            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: another file, or a model of another form.

@@ -7,8 +7,6 @@ Source:
     vzyrianov/lidargen@4c3226c (MIT), LiDARGen/runners/ncsn_runner.py.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -8,8 +8,6 @@ Source:
     LiDARGen, ECCV 2022; numbers from vzyrianov/lidargen@4c3226c (MIT).
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float

@@ -7,8 +7,6 @@ Source:
     Zyrianov et al., LiDARGen, ECCV 2022, section 3.4; numbers from vzyrianov/lidargen@4c3226c (MIT).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

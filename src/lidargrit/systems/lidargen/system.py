@@ -1,7 +1,5 @@
 """LiDARGen: score matching of log range and reflectance at many noise levels; seeds → range images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -192,13 +190,12 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel) -> LidarGen:
+    def from_published(cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel) -> "LidarGen":
         """Make a generator of one checkpoint, which tells its own sizes and noise levels, but not its ``log2_scale``.
 
         Args:
             files: checkpoint of the program; code in it is not run.
             config: settings that the file does not tell.
-            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: another file, or a model of another form.

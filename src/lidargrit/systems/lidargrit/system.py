@@ -1,7 +1,5 @@
 """LidarGRIT: a transformer generates the tokens of a VQ-VAE one by one, and its decoder makes range images of them."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Mapping, Sequence
@@ -179,9 +177,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
         Args:
             condition: observed part of the scans; None for new ones.
-            rngs: random generators on the CPU, one for each scan of a batch.
             count: number of scans to return.
-            sampling: settings of sampling.
         """
         self.check_choice(sampling.mask, sampling.pixels())
         uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
@@ -240,7 +236,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         self._prepared, self._one_at_a_time = None, threading.Lock()
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> LidarGrit:
+    def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> "LidarGrit":
         """Make a generator of a VQ-VAE's and a transformer's checkpoint, in which weights have the names of ours.
 
         The files tell neither the number of attention heads nor the order of tokens: only the order of the paper, row

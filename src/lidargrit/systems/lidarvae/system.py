@@ -1,7 +1,5 @@
 """LiDAR-VAE: a variational autoencoder of distance and height in 40 rows without holes; seeds → range images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -196,7 +194,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         return normal_latents(seeds, *count, self.config.latent_dim).to(self.device)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarVaeConfig, sensor: SensorModel) -> LidarVae:
+    def from_published(cls, files: Sequence[Path], config: LidarVaeConfig, sensor: SensorModel) -> "LidarVae":
         """Make a generator of one file of weights, such as ``gen_299.pth``, which tells its own sizes.
 
         The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
@@ -205,7 +203,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         Args:
             files: file of the program; code in it is not run.
             config: rows of the image and settings of the objective.
-            sensor: sensor whose rays are the pixels of the authors' images.
 
         Raises:
             CheckpointError: another file, or a model of another form, such as one of three coordinates.

@@ -1,7 +1,5 @@
 """Principal axes of a codebook: latents ⇄ fewer numbers of unit variance."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn

@@ -6,8 +6,6 @@ Source:
     Rombach et al., Latent Diffusion, CVPR 2022; numbers from hancyran/LiDAR-Diffusion@8416ddb (MIT).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

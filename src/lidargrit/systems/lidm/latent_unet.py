@@ -3,8 +3,6 @@
 Parameter names follow the reference's state dict, so that published weights load.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -73,7 +71,6 @@ class LatentUnet(Network):
     """Predicts the noise in latents; azimuth wraps.
 
     Args:
-        config: sizes of the network.
         latent_channels: number of channels of the input and of the output.
         grid_size: rows and columns of the latents.
 

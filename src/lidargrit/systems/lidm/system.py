@@ -1,7 +1,5 @@
 """LiDM: a diffusion model over the latents of a VQ autoencoder, LiDM's own or LidarGRIT's; seeds → range images."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -176,7 +174,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         return Cost(steps + 1, flops)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidmConfig, sensor: SensorModel) -> Lidm:
+    def from_published(cls, files: Sequence[Path], config: LidmConfig, sensor: SensorModel) -> "Lidm":
         """Make a generator of one checkpoint, which holds both networks and tells whether there is a mask channel.
 
         Other sizes are the configuration's. The moving average of the denoiser's weights is taken, or the weights
@@ -246,7 +244,7 @@ class LatentDenoising(Objective):
             return {name: weight for name, weight in weights.items() if name.startswith("denoiser.")}
         return weights
 
-    def _has_codebook_of(self, other: LatentDenoising) -> bool:
+    def _has_codebook_of(self, other: "LatentDenoising") -> bool:
         own, others = (one._latents.network(one.latent_scale.device).quantize.embedding.weight for one in (self, other))
         return not own.is_meta and torch.equal(own.cpu(), others.cpu())  # without values where a training is planned
 

@@ -1,7 +1,5 @@
 """Pixel statistics: every pixel sampled from its own histogram, as if it had no neighbours; seeds → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +84,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
     @classmethod
     def from_weights(
         cls, config: MarginalConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
-    ) -> Marginal:
+    ) -> "Marginal":
         """Make a generator of given counts.
 
         Raises:
@@ -106,11 +104,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         return _BATCH
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: NoSampling) -> RangeImage:
-        """Sample every pixel by itself.
-
-        Raises:
-            CheckpointError: nothing was counted yet.
-        """
+        """Sample every pixel by itself."""
         if not int(self.scans):
             raise CheckpointError("a generator that has counted no scan", "one that has", "call fit_statistics first")
         edges = self._edges_m().to(self.counts.device)

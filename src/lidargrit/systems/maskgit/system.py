@@ -1,7 +1,5 @@
 """MaskGIT over LidarGRIT's tokens: a transformer generates many of them at once, in few passes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Memorised training scans, as a reference row: seeds → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,7 +66,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
     @classmethod
     def from_weights(
         cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
-    ) -> Memorised:
+    ) -> "Memorised":
         """Make a generator that keeps as many scans as the weights hold.
 
         Raises:
@@ -84,11 +82,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
         return generator.eval()
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
-        """Return the scan of each seed: as many seeds in a row as there are scans give each of them once.
-
-        Raises:
-            CheckpointError: nothing was kept yet.
-        """
+        """Return the scan of each seed: as many seeds in a row as there are scans give each of them once."""
         if not int(self.scans):
             raise CheckpointError("a generator that has kept no scan", "one that has", "call fit_statistics first")
         range_m = self.range_m[torch.tensor([seed % int(self.scans) for seed in seeds])]

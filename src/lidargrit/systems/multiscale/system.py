@@ -1,7 +1,5 @@
 """A pixel decoder without tokens: seeds → range images from coarse to fine, each phase given all earlier ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from lidargrit.generation.batches import BatchSeeds

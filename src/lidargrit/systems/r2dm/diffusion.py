@@ -7,8 +7,6 @@ Source:
     as in Nakashima and Kurazume, R2DM, ICRA 2024, and kazuto1011/r2dm@1c5963d (MIT).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

@@ -10,8 +10,6 @@ Source:
     utils/option.py at 6ce7cc2 for the second.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """R2DM: a diffusion model of log range and reflectance, raydrop by a window of ranges; seeds → range images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -188,7 +186,7 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         return Cost(steps, steps * flops_of(self.network, (1, *self.shape), (1,)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: R2dmConfig, sensor: SensorModel) -> R2dm:
+    def from_published(cls, files: Sequence[Path], config: R2dmConfig, sensor: SensorModel) -> "R2dm":
         """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
         return load_published(files[0], sensor)
 

@@ -3,8 +3,6 @@
 Parameter names follow the reference's state dict, so that published weights load.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise
@@ -74,7 +72,6 @@ class EfficientUnet(Network):
     """Predicts noise in range images; azimuth wraps, and every pixel receives its ray's direction.
 
     Args:
-        config: sizes of the network.
         images: number of channels of the input and of the output.
         elevation_rad: elevation (H, W) of every pixel in radians.
         azimuth_rad: azimuth (H, W) of every pixel in radians.

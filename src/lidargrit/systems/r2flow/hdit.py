@@ -3,8 +3,6 @@
 Parameter names follow the reference's state dict, so that published weights load.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -66,7 +64,6 @@ class Hdit(Network):
     """Predicts the velocity of range images; azimuth wraps, and attention depends on the rays of the tokens.
 
     Args:
-        config: sizes of the network.
         images: number of channels of the images.
         elevation_rad: elevation of every pixel's ray in radians.
         azimuth_rad: azimuth of every pixel's ray in radians.
@@ -170,7 +167,6 @@ def _blocks(config: HditConfig, level: int, tokens: tuple[int, int]) -> nn.Modul
     """Return the blocks of one level, on one way.
 
     Args:
-        config: sizes of the network.
         level: index of the level, 0 for the finest.
         tokens: number of rows and columns of tokens in the finest level.
     """

@@ -1,7 +1,5 @@
 """Attention of tokens to their neighbours, on a grid whose columns wrap: (queries, keys, values) → values."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor

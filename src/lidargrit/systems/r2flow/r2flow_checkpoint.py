@@ -8,8 +8,6 @@ Source:
     r2flow/utils/option.py at 819d7d3 for files with it.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,7 +45,6 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> R2flowCheckpoint:
     """Read sizes, settings and weights; no network is built, and no code in the file is run.
 
     Args:
-        path: file of the program.
         sensor: sensor whose limits the ranges of the images must have.
 
     Raises:

@@ -1,7 +1,5 @@
 """R2Flow's trainings: a flow from noise to images, then pairs of noise and scan that straighten it."""
 
-from __future__ import annotations
-
 import copy
 import math
 from dataclasses import dataclass, field
@@ -96,7 +94,6 @@ def steps_of(sampling: FlowSampling, distilled_steps: int = 0) -> int:
     """Return the number of equal steps that a flow is followed in.
 
     Args:
-        sampling: settings of sampling.
         distilled_steps: number of steps that the network was distilled to; 0 if it was not.
 
     Raises:
@@ -153,7 +150,6 @@ class PairMatching(Objective):
 
     Args:
         network: network that is trained, from the weights that it has.
-        sensor: sensor of its range images.
         pairs: number of pairs to learn from; 64 further ones are for validation.
         solving: settings by which the flow is followed to make them.
         distilled_steps: number of equal steps at whose beginnings the network learns; 0 for all times, those near noise
@@ -204,7 +200,6 @@ class FlowPairs(Frozen[Hdit]):
 
     Args:
         network: network whose flow is followed; a copy with its present weights is kept.
-        sensor: sensor of its range images.
         solving: settings by which the flow is followed.
         bytes_at_most: bound of the memory that scans take.
     """

@@ -1,7 +1,5 @@
 """R2Flow: a rectified flow of log range and reflectance, raydrop by a window of ranges; seeds → range images."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,7 +122,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: R2flowConfig, sensor: SensorModel) -> R2flow:
+    def from_published(cls, files: Sequence[Path], config: R2flowConfig, sensor: SensorModel) -> "R2flow":
         """Make a generator of one checkpoint, which tells the sizes of its network, and if its flow was distilled.
 
         The network keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the

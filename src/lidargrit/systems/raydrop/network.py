@@ -1,7 +1,5 @@
 """A network of raydrop: the ranges of all surfaces → which of them return, sampled in phases, and how bright."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -81,12 +79,7 @@ class Returns(NamedTuple):
 
 
 class RaydropNetwork(nn.Module):
-    """A small U-Net over the ranges of all surfaces, and a mask that is sampled in phases behind it.
-
-    Args:
-        config: sizes of the network.
-        sensor: the rays and limits of the range images.
-    """
+    """A small U-Net over the ranges of all surfaces, and a mask that is sampled in phases behind it."""
 
     def __init__(self, config: RaydropNetworkConfig, sensor: SensorModel) -> None:
         super().__init__()
@@ -117,7 +110,6 @@ class RaydropNetwork(nn.Module):
         """Return features and logits of every ray.
 
         Args:
-            range_m: ranges of the surfaces, in metres.
             surface: True where a ray meets a surface; no other ray returns.
             label: class of each surface, 0 where it is not known; of use to a network with classes.
         """
@@ -145,7 +137,6 @@ class RaydropNetwork(nn.Module):
         Args:
             condition: surfaces of as many scans: the range of every ray that meets one, and no return for all other
                 rays.
-            rngs: random generators on the CPU, one for each scan.
         """
         images, uniform = [], self.mask.uniform(rngs)
         for index in range(len(rngs)):

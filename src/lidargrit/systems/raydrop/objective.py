@@ -1,7 +1,5 @@
 """What trains a network of raydrop: scans, with the ranges of all surfaces or without → the terms of a loss."""
 
-from __future__ import annotations
-
 import math
 
 import torch

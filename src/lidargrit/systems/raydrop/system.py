@@ -1,7 +1,5 @@
 """A network of raydrop: clean scans, in which every surface returns → the returns that a sensor would get of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import torch

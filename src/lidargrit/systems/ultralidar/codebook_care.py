@@ -1,7 +1,5 @@
 """Codes that no latent chooses → codes where latents are: k-means over a reservoir of latents, now and then."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -58,7 +56,6 @@ class CodebookCare(nn.Module):
             codes: codes of the codebook, changed in place.
             latents: latents of the step, of this process.
             tokens: index of the code that each of them chose.
-            rng: source of random numbers.
         """
         counts = torch.zeros(len(codes), device=codes.device).index_add_(0, tokens, torch.ones_like(tokens).float())
         used = sum_over_processes(counts) > 0

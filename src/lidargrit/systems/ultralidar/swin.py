@@ -6,8 +6,6 @@ Source:
     Liu et al., Swin Transformer, ICCV 2021, section 3.2.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

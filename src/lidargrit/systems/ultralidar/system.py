@@ -1,7 +1,5 @@
 """UltraLiDAR: voxels seen from above as tokens, filled in by a transformer in a few passes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -145,7 +143,6 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
 
         Args:
             seeds: one for each scan, from 0 to 2^32 - 1.
-            sampling: settings of sampling; its defaults if not given.
 
         Raises:
             ConfigError: no seed or one out of bounds, or settings of another generator.
@@ -176,7 +173,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         return Cost(sampling.steps + 1 + 3 * rounds, flops)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: UltraLidarConfig, sensor: SensorModel) -> UltraLidar:
+    def from_published(cls, files: Sequence[Path], config: UltraLidarConfig, sensor: SensorModel) -> "UltraLidar":
         """Make a generator of one checkpoint, which tells its own sizes, but not where its cells lie.
 
         Args:

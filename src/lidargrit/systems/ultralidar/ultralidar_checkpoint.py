@@ -7,8 +7,6 @@ Source:
     myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT).
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +54,6 @@ def read_ultralidar_checkpoint(path: Path, sizes: VoxelAutoencoderConfig) -> Ult
     """Read sizes and weights; no network is built, and no code in the file is run.
 
     Args:
-        path: file of the program.
         sizes: cells of the model, which the file does not tell.
 
     Raises:

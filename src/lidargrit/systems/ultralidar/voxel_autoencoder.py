@@ -7,8 +7,6 @@ Source:
     in myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT), which is not by the authors.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import torch.nn.functional as F

@@ -5,8 +5,6 @@ Source:
     myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

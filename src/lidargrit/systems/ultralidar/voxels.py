@@ -1,7 +1,5 @@
 """Points → occupied voxels about the sensor, and voxels → points, or range images along the sensor's rays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -61,7 +59,7 @@ class VoxelGrid:
         """Number of cells along z, y and x, the axes of a tensor of voxels."""
         return self.cells[2], self.cells[1], self.cells[0]
 
-    def swapped(self) -> VoxelGrid:
+    def swapped(self) -> "VoxelGrid":
         """Return the grid whose x axis is this one's y axis, and the other way round."""
         low_m, cell_m, cells = ((of[1], of[0], of[2]) for of in (self.low_m, self.cell_m, self.cells))
         return replace(self, low_m=low_m, cell_m=cell_m, cells=cells)
@@ -126,7 +124,6 @@ def images_of_voxels(
     Args:
         occupied: voxels of each scan.
         grid: cells of the box.
-        sensor: sensor whose rays the pixels are.
         variant: ``exact``, or ``reference`` for a picture of the clouds that UltraLiDAR's program writes: x and y are
             swapped, and the lower corner stands for the centre.
     """
@@ -182,7 +179,6 @@ class _Rays:
         """Distances along the ray at which it enters and leaves its voxel."""
 
     def advance(self) -> None:
-        """Move on to the next voxels."""
         self._moved = self.exit_m < self._end_m
         step = (self._next_m == self.exit_m) & self._moved
         self.voxel = self.voxel + (self._voxels * step).sum(dim=0)

@@ -4,8 +4,6 @@ No path of a request is used as a path on disk: it is compared with a handful of
 a name of this machine is refused, so that no web page elsewhere can reach this server through somebody's browser.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import ipaddress
@@ -153,7 +151,6 @@ class Application:
         raise RefusedRequestError("404 Not Found", "There is no such scan, or it is no longer kept.")
 
     def _file(self, job: Job, scan_set: int, index: int, ending: str) -> Response:
-        """Write one scan of a result in a format that other programs read."""
         sensor = SensorModel.from_json(self._queue.models[job.request.model]["rays"])
         with np.load(job.folder / PIXELS_FILE, allow_pickle=False) as pixels:
             range_m = torch.from_numpy(pixels[f"range_m_{scan_set}"][index])

@@ -1,7 +1,5 @@
 """Jobs one after another: requests → results on disk, with a bounded queue and a limit of time for each."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools
@@ -49,7 +47,6 @@ class JobQueue:
     Args:
         runs: folders of finished runs.
         folder: an empty folder for uploads and results; the caller removes it.
-        device: device of the networks; "" for a GPU if there is one.
         limits: bounds on what may be asked for.
 
     Raises:
@@ -69,7 +66,7 @@ class JobQueue:
         self._thread = threading.Thread(target=self._run_jobs, daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> JobQueue:
+    def __enter__(self) -> "JobQueue":
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:

@@ -1,7 +1,5 @@
 """Bounds on what a client of the server may ask for: numbers with their reasons, in one place."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from lidargrit.core.errors import ConfigError

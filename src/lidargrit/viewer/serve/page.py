@@ -1,7 +1,5 @@
 """The page of the server: a form and the viewer's parts, files in ``browser/`` → HTML, script and style."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lidargrit.core.untrusted import SEED_AT_MOST

@@ -1,7 +1,5 @@
 """A client's JSON → a request whose every value is checked; and the numbers of a generator that a client may set."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import math

@@ -1,7 +1,5 @@
 """Run folders → a page at an address of this machine, until somebody ends it."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import logging
@@ -57,7 +55,6 @@ def serve(
         say: function that prints the address, and a warning where others reach it.
         host: address to listen at; a loopback one keeps the page to this machine.
         port: port to listen at; 0 for any that is free.
-        device: device of the networks; "" for a GPU if there is one.
         limits: bounds on what clients may ask for.
 
     Raises:

@@ -4,8 +4,6 @@ The process reads and answers lines of JSON: no pickle passes, and the process t
 A job that takes too long, or all memory, ends with this process; the next job starts a new one.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
@@ -196,7 +194,6 @@ def _cure_on_the_page(request: SampleRequest, generator: Generator, scan: Scan) 
 
 
 def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
-    """Return the mask of the pixels that are kept."""
     if request.task in UPSAMPLED:
         return observed_rows(seen)
     if request.task == "region":
@@ -219,7 +216,6 @@ def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
 def _answer_request(
     generator: Generator, variant: ProjectionVariant, request: SampleRequest, folder: Path
 ) -> dict[str, Any]:
-    """Write a result into a folder, and return the answer."""
     try:
         sets = compute_result(generator, request, variant)
         pixels: dict[str, Any] = {}

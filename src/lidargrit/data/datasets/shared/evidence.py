@@ -1,7 +1,5 @@
 """What the points of a file say of the sensor that made it, where only a folder's layout names the data set."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +17,6 @@ def contradicts_hdl64e(path: Path, form: type[ScanFormat]) -> bool:
     """Return whether the points of a scan cannot be an HDL-64E's; False where too few tell.
 
     Args:
-        path: file of a scan.
         form: format of that file.
     """
     try:

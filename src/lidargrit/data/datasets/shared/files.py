@@ -1,7 +1,5 @@
 """What data sets of files share: a folder → its files in order, the split of them that is wanted, and their scans."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

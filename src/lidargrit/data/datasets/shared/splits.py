@@ -1,7 +1,5 @@
 """Splits as users type them: "train", "00+03", "all[:90%]" → names of sequences and a share of their scans."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -28,7 +26,7 @@ class Split:
     end_percent: float
 
     @classmethod
-    def parse(cls, text: str, known: Collection[str] = ()) -> Split:
+    def parse(cls, text: str, known: Collection[str] = ()) -> "Split":
         """Read a split.
 
         Args:

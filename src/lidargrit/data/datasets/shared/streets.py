@@ -1,7 +1,5 @@
 """What data sets of simulated streets share: a count and a split → seeds, one street each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import ClassVar
 

@@ -1,7 +1,5 @@
 """Bare float32 numbers of a file without a header ⇄ named columns, and how many of them make a point."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Named columns, as PCD, PLY and NumPy files hold them ⇄ :class:`Scan`."""
 
-from __future__ import annotations
-
 import math
 import re
 import warnings
@@ -53,8 +51,6 @@ def scan_of_columns(
 
     Args:
         columns: values of every point by their names.
-        path: path of the file, for messages.
-        bad_points: treatment of points that are no returns.
         others: names of columns that were not read.
         are_named: whether the file itself has the names; where it has not, reflectance that is none shows another
             layout, and is refused.

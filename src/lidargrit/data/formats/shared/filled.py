@@ -1,7 +1,5 @@
 """``NAME.filled`` beside a file of points without room for it: one byte a point, 1 where a model added the point."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Labels of points → a word where they are no numbers of SemanticKITTI."""
 
-from __future__ import annotations
-
 from jaxtyping import Int
 from torch import Tensor
 

@@ -7,8 +7,6 @@ Source:
     The MCAP format specification, https://mcap.dev/spec; the records are unpacked by the library mcap.
 """
 
-from __future__ import annotations
-
 import os
 import zlib
 from collections import Counter

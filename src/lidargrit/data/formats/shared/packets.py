@@ -1,7 +1,5 @@
 """Recordings of packets, .pcap and .pcapng → checked record by record, before a library of C++ is given them."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from io import BufferedReader

@@ -1,7 +1,5 @@
 """Rows of an element of a PLY file, lists among their properties → columns of the properties that are no list."""
 
-from __future__ import annotations
-
 from io import BytesIO
 from typing import NamedTuple
 
@@ -12,7 +10,6 @@ class Property(NamedTuple):
     """A property of each row of an element.
 
     Args:
-        name: name of the property.
         kind: numpy type of its value, or of each value of a list.
         count_kind: numpy type of the number of values of a list; "" for a single value.
     """
@@ -26,7 +23,6 @@ class Element(NamedTuple):
     """An element of a header.
 
     Args:
-        name: name of the element.
         rows: number of its rows.
         properties: properties of each row, in order.
     """

@@ -1,7 +1,5 @@
 """A message sensor_msgs/PointCloud2 of ROS → its named columns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Columns of a file that may be reflectance → the one that is, as values from 0 to 1."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

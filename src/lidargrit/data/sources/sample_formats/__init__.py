@@ -1,7 +1,5 @@
 """Samples as other programs write them, one tensor a file: folder of .pth → range images."""
 
-from __future__ import annotations
-
 import math
 import re
 import zipfile
@@ -149,8 +147,6 @@ def read_tensor(path: Path) -> Tensor:
 
 
 class _Tensors:
-    """Files of tensors as a store of images."""
-
     def __init__(self, paths: list[Path], form: SampleFormat, count: int | None) -> None:
         self._format, self._last = form, (Path(), torch.empty(0))
         first = self._tensor(paths[0])

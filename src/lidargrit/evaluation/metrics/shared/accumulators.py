@@ -1,7 +1,5 @@
 """Accumulators of a metric: summaries of batches → one summary of a set, which can be merged from parts."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Generic, TypeVar
 
@@ -18,7 +16,7 @@ class Accumulator(ABC, Generic[Kept]):
         """Take in the summary of a batch of at least one image."""
 
     @abstractmethod
-    def merge(self, other: Accumulator[Kept]) -> None:
+    def merge(self, other: "Accumulator[Kept]") -> None:
         """Take in what another accumulator of the same class has collected; the other stays as it is."""
 
     @abstractmethod

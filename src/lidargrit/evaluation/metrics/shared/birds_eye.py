@@ -1,7 +1,5 @@
 """Points → counts seen from above: 1.6 m cells as each program of this field makes them, finer ones as LiDM's does."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

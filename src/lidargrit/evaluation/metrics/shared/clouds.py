@@ -1,7 +1,5 @@
 """Range images → clouds of 512 points that lie far from one another, in units of the sensor's longest range."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import final
 

@@ -1,7 +1,5 @@
 """Counts in the pixels of two sets of range images → curves → the Jensen-Shannon distance between them."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -203,7 +201,7 @@ class LocalSurface:
     incidence_rad: Float[Tensor, "B H W"]
 
     @classmethod
-    def of(cls, images: RangeImage) -> LocalSurface:
+    def of(cls, images: RangeImage) -> "LocalSurface":
         """Estimate the surface at every pixel of a batch."""
         sensor = images.sensor
         size = (sensor.height, sensor.width)

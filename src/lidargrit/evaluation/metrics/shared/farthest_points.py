@@ -1,7 +1,5 @@
 """Farthest point sampling: point clouds → the indices of a few points that lie far from one another."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 

@@ -1,7 +1,5 @@
 """Two sets of clouds → which cloud is nearest to which, by the Chamfer distance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Range images → the features that a pretrained network finds in them, for metrics that compare two sets of these."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
@@ -45,14 +43,13 @@ class UnitClouds:
     returns_only: bool
 
     @classmethod
-    def of(cls, variant: str, sensor: SensorModel) -> UnitClouds:
+    def of(cls, variant: str, sensor: SensorModel) -> "UnitClouds":
         """Return the inputs of a published definition for images of a sensor.
 
         Args:
             variant: ``lidargrit`` divides by the sensor's longest range, and on KITTI-360 sensors takes what is not
                 between 0.5 and 63 m for dropped; ``r2dm`` does so on all sensors and divides by 80 m; both keep dropped
                 pixels as points at the origin. ``exact`` takes all returns and nothing else.
-            sensor: the sensor of the images.
         """
         if variant == "r2dm":
             return cls(_R2DM_UNIT_M, _LIDARGEN_WINDOW_M, False)
@@ -81,7 +78,7 @@ class NormalisedImages:
     window_m: tuple[float, float] | None
 
     @classmethod
-    def of(cls, variant: str) -> NormalisedImages:
+    def of(cls, variant: str) -> "NormalisedImages":
         """Return the inputs of a published definition: ``r2dm`` keeps 0.5 to 63 m, ``exact`` takes all returns."""
         return cls(_LIDARGEN_WINDOW_M if variant == "r2dm" else None)
 
@@ -133,10 +130,6 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
 
     Args:
         variant: the published definition to compute; the first of ``variants`` if not given.
-        seed: seed of all random numbers of the metric.
-        weights: file with the network's weights; found or fetched if not given.
-        device: device on which the network computes, such as "cuda".
-        reporter: receives messages and the progress of a download.
 
     Raises:
         WeightsError: no weights, or not those of the network.

@@ -1,7 +1,5 @@
 """Two sets of features → Fréchet distance of the normal distributions with their means and covariances."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -35,13 +33,13 @@ class Moments(Accumulator["Moments"]):
         mean = vectors.mean(axis=0)
         self._join(len(vectors), mean, [vectors - mean] if len(vectors) > 1 else [])
 
-    def merge(self, other: Accumulator[Moments]) -> None:
+    def merge(self, other: "Accumulator[Moments]") -> None:
         """Take in the vectors that another has seen."""
         moments = other.value()
         if moments.num:
             self._join(moments.num, moments.mean, moments._rows)
 
-    def value(self) -> Moments:
+    def value(self) -> "Moments":
         """Return the moments themselves."""
         return self
 

@@ -1,7 +1,5 @@
 """Two sets of features → squared maximum mean discrepancy under a cubic kernel, which small sets do not bias."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Layers of networks that others have trained and that learn no more: features → features."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """A network's name and the file with its weights → features of images."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -36,7 +34,6 @@ class PretrainedNetwork:
     Args:
         name: name of the network, one of ``NETWORKS``.
         path: file with its weights.
-        device: device on which it computes, such as "cuda".
 
     Raises:
         WeightsError: the file is not to be had, or not of this network.
@@ -83,9 +80,6 @@ def load_network(
 
     Args:
         name: name of the network, one of ``NETWORKS``.
-        weights: file with its weights; found or fetched if not given.
-        device: device on which it computes, such as "cuda".
-        reporter: receives messages and the progress of a download.
 
     Raises:
         WeightsError: the file is not to be had, or not of this network.

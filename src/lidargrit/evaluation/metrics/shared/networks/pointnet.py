@@ -1,7 +1,5 @@
 """PointNet, trained to tell 16 kinds of objects apart: clouds in unit space → 1808 features of each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

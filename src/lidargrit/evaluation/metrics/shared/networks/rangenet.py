@@ -1,7 +1,5 @@
 """RangeNet-53, trained to tell 19 classes of a street apart: range images → 4096 values of its last feature map."""
 
-from __future__ import annotations
-
 import random
 from collections import OrderedDict
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Published weights of a network → a file on this computer, downloaded if necessary → tensors."""
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import http.client
