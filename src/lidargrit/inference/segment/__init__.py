@@ -1,7 +1,6 @@
 """A segmenter and range images → their labels, also where the images have more columns than the segmenter's sensor."""
 
 import math
-from dataclasses import replace
 
 import torch
 
