@@ -23,7 +23,6 @@ from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PLAN_FILE, SCANS_FILE, PreparedImages, shard_name
 from lidargrit.data.prepared.shards import ShardWriter
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.scans.types import RangeImage
 
 
 def main() -> None:
@@ -64,11 +63,7 @@ def repeat(few: Path, many: Path, count: int) -> Path:
     many.mkdir()
     write_text(many / SCANS_FILE, json.dumps([[f"image {index}", "", 0, 0] for index in range(count)]))
     write_json(many / PLAN_FILE, asdict(spec))
-    pixels = [RangeImages(store.sensor, [store]).batch([index]) for index in range(len(store))]
-    images = [
-        RangeImage(one.range_m[0], one.return_mask[0], one.sensor, None if (r := one.reflectance) is None else r[0])
-        for one in pixels
-    ]
+    images = [RangeImages(store.sensor, [store]).batch([index])[0] for index in range(len(store))]
     for shard in range(spec.num_shards):
         writer = ShardWriter(spec.range_step_m)
         for index in spec.scans_of(shard):

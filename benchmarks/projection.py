@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from lidargrit.data.datasets import open_dataset
+from lidargrit.scans.planes import planes_of
 from lidargrit.scans.projection import index_map, project
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
@@ -86,7 +87,7 @@ def image_of(winner: np.ndarray, scan: Scan, sensor: SensorModel) -> RangeImage:
     reflectance = None
     if scan.reflectance is not None:
         reflectance = torch.from_numpy(np.where(filled, scan.reflectance.numpy()[winner], np.float32(0)))
-    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, reflectance)
+    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, planes_of(reflectance=reflectance))
 
 
 def best_ms(work, repeats: int) -> float:

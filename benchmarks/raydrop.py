@@ -23,6 +23,7 @@ from lidargrit.evaluation.raydrop import RAYDROP_CURVES
 from lidargrit.evaluation.realism import distance, drop_independently, pair_of
 from lidargrit.generation.generator import load
 from lidargrit.scans.condition import Observed
+from lidargrit.scans.planes import planes_of
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import observe
 from lidargrit.systems.raydrop.system import Raydrop
@@ -107,7 +108,7 @@ def reflectance_table(found: RangeImage, true: RangeImage, others: RangeImage) -
     for name, reflectance in estimates.items():
         assert reflectance is not None
         error = float((reflectance[both] - _values(true, both)).double().abs().mean())
-        image = RangeImage.masked(true.range_m, both, true.sensor, reflectance)
+        image = RangeImage.masked(true.range_m, both, true.sensor, planes_of(reflectance=reflectance))
         lines.append(f"| {name} | {error:.4f} | {distance('reflectance_histogram', [image], iter([true])).value:.4f} |")
     lines.append(f"| other streets |  | {distance('reflectance_histogram', [others], iter([true])).value:.4f} |")
     return "\n".join(lines)

@@ -18,7 +18,9 @@ def street(sensor, seed: int = 0, share: float = 0.85) -> RangeImage:
     rng = torch.Generator().manual_seed(seed)
     returned = torch.rand(elevation_rad.shape, generator=rng) < share
     bright = torch.rand(elevation_rad.shape, generator=rng)
-    return RangeImage.masked(torch.minimum(wall_m / elevation_rad.cos(), ground_m), returned, sensor, bright)
+    return RangeImage.masked(
+        torch.minimum(wall_m / elevation_rad.cos(), ground_m), returned, sensor, {"reflectance": bright}
+    )
 
 
 def network(kind) -> Model:

@@ -35,7 +35,7 @@ def example(cls: type[ScanFormat], columns: int = 64) -> Scan:
     range_m = torch.where(down > 0, 1.73 / down.clamp(min=1e-3), 1000.0).minimum(20 + 8 * (3 * azimuth_rad).sin())
     returned = torch.rand(range_m.shape, generator=torch.Generator().manual_seed(0)) < 0.9
     reflectance = (0.5 + 0.49 * (5 * azimuth_rad).cos()) * returned
-    scan = unproject(RangeImage(range_m * returned, returned, sensor, reflectance))
+    scan = unproject(RangeImage(range_m * returned, returned, sensor, {"reflectance": reflectance}))
     assert scan.ring is not None
     assert scan.reflectance is not None
     circle_rad = torch.atan2(*scan.points_xyz_m[:, :2].double().T.flip(0)) % (2 * math.pi)

@@ -32,7 +32,8 @@ def wall(sensor, seed: int, reflectance: bool = True) -> RangeImage:
     size = (sensor.height, sensor.width)
     range_m = 10 + 5 * torch.rand(size, generator=rng)
     returned = torch.rand(size, generator=rng) < 0.9
-    return RangeImage.masked(range_m, returned, sensor, torch.rand(size, generator=rng) if reflectance else None)
+    planes = {"reflectance": torch.rand(size, generator=rng)} if reflectance else {}
+    return RangeImage.masked(range_m, returned, sensor, planes)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +108,9 @@ def test_a_scan_with_nothing_observed_is_left_out(run, tmp_path, capsys):
 
 def test_a_scan_without_a_drop_is_left_out(run, tmp_path, capsys):
     source, size = scan_files(tmp_path / "scans", 2), (SENSOR.height, SENSOR.width)
-    whole = RangeImage.masked(torch.full(size, 9.0), torch.ones(size, dtype=torch.bool), SENSOR, torch.rand(size))
+    whole = RangeImage.masked(
+        torch.full(size, 9.0), torch.ones(size, dtype=torch.bool), SENSOR, {"reflectance": torch.rand(size)}
+    )
     NumpyArray.write(tmp_path / "scans" / "00.npz", unproject(whole))
     assert complete(run, source, tmp_path / "out", "--observed", "returns", "--bad-scans", "skip") == 0
     assert "00.npz, in which every pixel has a return" in capsys.readouterr().err
@@ -127,7 +130,7 @@ def test_columns_in_which_a_sensor_never_fires_are_unknown():
     source = load_sensor("vlp16").with_columns(100)
     wanted = load_sensor("hdl64e_kitti_odometry")  # 256 columns
     image = RangeImage.masked(
-        torch.full((16, 100), 20.0), torch.ones(16, 100, dtype=torch.bool), source, torch.rand(16, 100)
+        torch.full((16, 100), 20.0), torch.ones(16, 100, dtype=torch.bool), source, {"reflectance": torch.rand(16, 100)}
     )
     scan = unproject(image)
     seen = SparseReader(wanted, source=source).read(scan)

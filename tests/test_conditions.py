@@ -21,7 +21,9 @@ def scans(count: int = 2) -> RangeImage:
     rng = torch.Generator().manual_seed(1)
     size = (count, 64, 32)
     mask = torch.rand(size, generator=rng) < 0.8
-    return RangeImage.masked(2 + 40 * torch.rand(size, generator=rng), mask, SENSOR, torch.rand(size, generator=rng))
+    return RangeImage.masked(
+        2 + 40 * torch.rand(size, generator=rng), mask, SENSOR, {"reflectance": torch.rand(size, generator=rng)}
+    )
 
 
 def test_what_was_observed_stands_bit_for_bit_and_the_rest_is_generated():
@@ -75,12 +77,14 @@ def test_reflectance_labels_and_unknown_pixels_that_cannot_be_are_refused():
     assert bright is not None
     for wrong in (bright * 255, bright - 1, bright * torch.nan):
         with pytest.raises(ScanError, match=r"reflectance is NaN, below 0 or above 1; wanted values in \[0, 1\]"):
-            Observed.of_pixels(replace(images, reflectance=wrong), every)
+            Observed.of_pixels(images.with_planes(reflectance=wrong), every)
     beyond = torch.where(images.return_mask, bright, 2.0)
     mask = images.return_mask
-    assert len(Observed(images.range_m, mask, mask, mask, SENSOR, beyond)) == 2, "values elsewhere have no influence"
-    with pytest.raises(ConfigError, match=r"^got labels of type torch.float32; wanted whole numbers"):
-        Observed.of_pixels(replace(images, label=bright), every)
+    assert len(Observed(images.range_m, mask, mask, mask, SENSOR, {"reflectance": beyond})) == 2, (
+        "values elsewhere have no influence"
+    )
+    with pytest.raises(ConfigError, match=r"^got label of type torch.float32; wanted whole numbers"):
+        Observed.of_pixels(images.with_planes(label=bright), every)
     with pytest.raises(ConfigError, match=r"^got unknown pixels of .* and type torch.float32; wanted .*torch.bool"):
         Observed.of_surfaces(images, every.float())
 
@@ -89,10 +93,11 @@ def test_reflectance_labels_and_unknown_pixels_that_cannot_be_are_refused():
 def test_images_and_conditions_are_kept_in_32_bits(dtype):
     images = scans()
     assert images.reflectance is not None
-    given = replace(images, range_m=images.range_m.to(dtype), reflectance=images.reflectance.to(dtype))
+    given = replace(images, range_m=images.range_m.to(dtype), planes={"reflectance": images.reflectance.to(dtype)})
     assert given.range_m.dtype == given.reflectance.dtype == torch.float32
     mask = images.return_mask
-    known = Observed(images.range_m.to(dtype), mask, mask, mask, SENSOR, images.reflectance.to(dtype))
+    planes = {"reflectance": images.reflectance.to(dtype)}
+    known = Observed(images.range_m.to(dtype), mask, mask, mask, SENSOR, planes)
     assert known.range_m.dtype == known.reflectance.dtype == torch.float32
     assert torch.equal(known.range_m, given.range_m)
 
@@ -164,7 +169,7 @@ def test_the_nearest_observed_pixel_is_that_of_the_smallest_angle_around_the_cir
 def test_what_was_not_observed_has_no_influence_where_nothing_returned():
     none, every = torch.zeros(1, 64, 32, dtype=torch.bool), torch.ones(1, 64, 32, dtype=torch.bool)
     stray = torch.full((1, 64, 32), 0.7)
-    known = Observed(9 * stray, none, none, every, SENSOR, stray, torch.full((1, 64, 32), 50))
+    known = Observed(9 * stray, none, none, every, SENSOR, {"reflectance": stray, "label": torch.full((1, 64, 32), 50)})
     filled = fill_lacking(RangeImage(9 * stray, every, SENSOR), known)
     assert torch.equal(filled.reflectance, torch.zeros(1, 64, 32))
     assert not filled.label.any()

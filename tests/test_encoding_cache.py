@@ -60,7 +60,9 @@ def test_a_copy_of_what_holds_it_shares_network_and_results():
 def test_images_of_other_reflectance_are_others():
     image = scans(1)
     dark, bright = (
-        RangeImage(image.range_m, image.return_mask, SENSOR, torch.where(image.return_mask, value, 0.0))
+        RangeImage(
+            image.range_m, image.return_mask, SENSOR, {"reflectance": torch.where(image.return_mask, value, 0.0)}
+        )
         for value in (0.1, 0.9)
     )
 

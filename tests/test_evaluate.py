@@ -43,7 +43,8 @@ class WithReflectance:
     def read(self, index: int) -> Pixels:
         rng = np.random.default_rng(index)
         size = (SENSOR.height, SENSOR.width * SENSOR.column_stride)
-        return Pixels(rng.uniform(2, 60, size).astype(np.float32), rng.uniform(0, 1, size).astype(np.float32))
+        range_m = rng.uniform(2, 60, size).astype(np.float32)
+        return Pixels(range_m, {"reflectance": rng.uniform(0, 1, size).astype(np.float32)})
 
 
 def write_scans(folder, count, seed, variant=""):

@@ -156,7 +156,7 @@ def images(seed, count):
     smooth = torch.rand(count, 64, 8, generator=rng).repeat_interleave(8, dim=2)
     range_m = 2 + 40 * smooth + torch.rand(count, 64, 64, generator=rng)
     mask = torch.rand(count, 64, 64, generator=rng) < 0.8
-    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, torch.where(mask, smooth, 0))
+    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, {"reflectance": torch.where(mask, smooth, 0)})
 
 
 @pytest.mark.parametrize("name", PLAIN)

@@ -29,17 +29,15 @@ def test_range_reflectance_and_label_are_of_one_return():
     range_m = rng.integers(0, 3, (4, 60)).astype(np.float32)
     reflectance = (rng.random((4, 60)) * (range_m > 0)).astype(np.float32)
     label = rng.integers(1, 99, (4, 60)) * (range_m > 0)
-    pixels = Pixels(range_m, reflectance, label)
+    pixels = Pixels(range_m, {"reflectance": reflectance, "label": label})
     for wanted in (60, 20, 17):
         got = FewerColumns(OneImage(pixels), 60, wanted).read(0)
-        assert got.reflectance is not None
-        assert got.label is not None
-        assert got.reflectance.dtype == np.float32
+        assert got.planes["reflectance"].dtype == np.float32
         new_column = [int((column + 0.5) * wanted / 60) for column in range(60)]
         for row in range(4):
             for column in range(wanted):
                 olds = [old for old in range(60) if new_column[old] == column and range_m[row, old] > 0]
-                pixel = (got.range_m[row, column], got.reflectance[row, column], got.label[row, column])
+                pixel = (got.range_m[row, column], *(got.planes[name][row, column] for name in pixels.planes))
                 if not olds:
                     assert pixel == (0, 0, 0)
                     continue

@@ -15,11 +15,10 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.generation.generator import load
-from lidargrit.generation.semantic_classes import CLASSES, class_indices, labels_of
+from lidargrit.scans.classes import LEARNED
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.fills import fill, fill_lacking
-from lidargrit.scans.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
@@ -45,7 +44,7 @@ def streets(count: int) -> RangeImage:
     range_m = (10 + 5 * angle.cos()).expand(count, 64, 32)
     label = torch.where(torch.arange(64)[:, None] < 30, BUILDING, ROAD).expand(count, 64, 32)
     returned = torch.rand(count, 64, 32, generator=rng) < 0.8
-    return RangeImage.masked(range_m, returned, SENSOR, label=label)
+    return RangeImage.masked(range_m, returned, SENSOR, {"label": label})
 
 
 @pytest.fixture(scope="module")
@@ -64,14 +63,6 @@ def folders(tmp_path_factory):
     return root
 
 
-def test_the_simulator_has_no_label_that_is_forgotten():
-    unlearned = {number for number in LABELS if not int(class_indices(torch.tensor(number)))}
-    assert unlearned == {OTHER_STRUCTURE, OTHER_OBJECT}
-    numbers = [number for several in CLASSES.values() for number in several]
-    assert len(numbers) == len(set(numbers))
-    assert labels_of(class_indices(torch.tensor([0, 1, ROAD, MOVING_CAR, 9999]))).tolist() == [0, 0, ROAD, 10, 0]
-
-
 def test_a_pixel_has_the_class_of_its_point_through_projection_and_preparation(folders, tmp_path):
     source = f"kitti_odometry:{folders / 'tree'}"
     scan = KittiOdometry(folders / "tree").scan(0)
@@ -88,8 +79,7 @@ def test_a_pixel_has_the_class_of_its_point_through_projection_and_preparation(f
     folder = prepare(source, config, tmp_path / "prepared", sensor=replace(SENSOR, projection="spherical"))
     store = PreparedImages(str(folder))
     pixels = store.read(0, verify=True)
-    assert pixels.label is not None
-    assert np.array_equal(pixels.label, image.label.numpy())
+    assert np.array_equal(pixels.planes["label"], image.label.numpy())
     shard = folder / "000000.shard"
     content = bytearray(shard.read_bytes())
     content[store._entries[0][1].end - 1] ^= 255  # the last byte of the first image, of its classes
@@ -103,7 +93,7 @@ def test_a_flip_and_a_batch_keep_the_class_of_a_pixel():
     assert joined.label is not None
     assert images.label is not None
     assert torch.equal(joined.label[0].flip(-1), images.label[1])
-    assert RangeImage.stack([images[0], replace(images[1], label=None)]).label is None
+    assert RangeImage.stack([images[0], images[1].with_planes(label=None)]).label is None
 
 
 def test_hints_tell_the_class_of_the_next_return_on_every_side():
@@ -111,7 +101,7 @@ def test_hints_tell_the_class_of_the_next_return_on_every_side():
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     label = torch.zeros(1, 64, 32, dtype=torch.int64)
     label[0, 10, 4], label[0, 10, 30], label[0, 20, 6] = 40, 50, 70
-    image = RangeImage(range_m, range_m > 0, SENSOR, label=label)
+    image = RangeImage(range_m, range_m > 0, SENSOR, {"label": label})
     found = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.labels is not None
     assert found.labels[0, :, 10, 6].tolist() == [70, 70, 70, 40, 50]  # nothing above: as the nearest, that below
@@ -127,7 +117,7 @@ def test_it_learns_classes_and_begins_with_those_of_neighbours():
     assert 0.4 < accuracies[0] < 0.95
     assert accuracies[-1] > accuracies[0]
     with pytest.raises(ConfigError, match="training scans without labels"):
-        objective(Example(replace(images, label=None)), torch.Generator())
+        objective(Example(images.with_planes(label=None)), torch.Generator())
 
 
 def test_without_labels_in_the_model_nothing_grows_and_with_them_it_begins_the_same():
@@ -164,7 +154,7 @@ def test_a_labelled_tree_is_completed_as_a_labelled_tree(folders, tmp_path, caps
     ]
     assert len(same) > 300
     assert all(same)  # with their instances
-    assert set((after.label & 0xFFFF).tolist()) <= {0, *(numbers[0] for numbers in CLASSES.values())}
+    assert set((after.label & 0xFFFF).tolist()) <= {0, *LEARNED}
     capsys.readouterr()
     assert main([*words[:2], str(tmp_path / "bin"), *words[3:], "--device", "cpu"]) == 0
     assert ".bin keeps no labels; --format kitti_odometry or npz keeps them" in capsys.readouterr().err
@@ -178,7 +168,7 @@ def test_a_scan_without_labels_gets_none(folders):
     observed = known.return_observed
     assert images.label is not None
     assert torch.equal(with_labels[observed], images.label[observed])
-    assert model.complete(every_fourth_row(replace(images, label=None)), [3]).label is None
+    assert model.complete(every_fourth_row(images.with_planes(label=None)), [3]).label is None
 
 
 def test_raydrop_sees_classes_and_keeps_those_of_what_returns(folders, tmp_path):
@@ -199,7 +189,7 @@ def test_raydrop_learns_what_a_class_does():
     torch.manual_seed(0)
     images = streets(3)
     assert images.label is not None
-    marked = replace(images, reflectance=((images.label == ROAD) & images.return_mask).float())  # walls never return
+    marked = images.with_planes(reflectance=((images.label == ROAD) & images.return_mask).float())  # walls never return
     found = {}
     for labels in (False, True):
         network = RaydropNetwork(replace(RAYDROP, labels=labels), SENSOR)

@@ -303,7 +303,7 @@ def test_a_scan_is_completed_from_its_observed_pixels_alone():
     done = generator.complete(Observed.of_pixels(images, observed), [0, 1])
     assert torch.equal(done.range_m[observed], images.range_m[observed])
     hidden = RangeImage.masked(
-        torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.reflectance
+        torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.planes
     )
     assert torch.equal(generator.complete(Observed.of_pixels(hidden, observed), [0, 1]).range_m, done.range_m)
     assert not torch.equal(generator.complete(Observed.of_pixels(images, observed), [2, 3]).range_m, done.range_m)

@@ -34,7 +34,8 @@ def walls(count=2, reflectance=True):
     rng = torch.Generator().manual_seed(0)
     mask = torch.rand(count, 64, 32, generator=rng) < 0.8
     range_m = torch.where(mask, (2 + 50 * torch.rand(count, 1, 32, generator=rng)).expand(-1, 64, -1), 0)
-    return RangeImage(range_m, mask, SENSOR, torch.rand(count, 64, 32, generator=rng) * mask if reflectance else None)
+    bright = torch.rand(count, 64, 32, generator=rng) * mask
+    return RangeImage(range_m, mask, SENSOR, {"reflectance": bright} if reflectance else {})
 
 
 def made(**settings):
@@ -289,9 +290,8 @@ def test_a_completed_scan_keeps_what_was_observed_whichever_pixels_these_are():
     done = generator.complete(Observed.of_pixels(images, observed), [0, 1], sampling)
     for name in ("range_m", "return_mask", "reflectance"):
         assert torch.equal(getattr(done, name)[observed], getattr(images, name)[observed])
-    hidden = RangeImage.masked(
-        torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed, SENSOR, images.reflectance
-    )
+    range_m, mask = torch.where(observed, images.range_m, 9.0), images.return_mask | ~observed
+    hidden = RangeImage.masked(range_m, mask, SENSOR, images.planes)
     again = generator.complete(Observed.of_pixels(hidden, observed), [0, 1], sampling)
     assert torch.equal(again.range_m, done.range_m)
     # What the network sees of the observed pixels reaches the others.

@@ -37,7 +37,7 @@ def images(sensor=SMALL, count=3, seed=0, reflectance=True):
     range_m = sensor.range_min_m + torch.rand(shape, generator=rng) * (sensor.range_max_m - sensor.range_min_m)
     mask = torch.rand(shape, generator=rng) > 0.2
     bright = torch.where(mask, torch.rand(shape, generator=rng), 0.0)
-    return RangeImage(torch.where(mask, range_m, 0.0), mask, sensor, bright if reflectance else None)
+    return RangeImage(torch.where(mask, range_m, 0.0), mask, sensor, {"reflectance": bright} if reflectance else {})
 
 
 # --- the networks themselves

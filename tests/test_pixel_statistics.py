@@ -32,7 +32,7 @@ class IndependentPixels:
 
     def read(self, index: int) -> Pixels:
         reflectance = np.full(self.size[1:], (index + 1) / (1 + len(self)), np.float32)
-        return Pixels(self.range_m[index], reflectance * (self.range_m[index] > 0))
+        return Pixels(self.range_m[index], {"reflectance": reflectance * (self.range_m[index] > 0)})
 
 
 def pair_of(count: int, seed: int = 0) -> EvalPair:

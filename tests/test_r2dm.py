@@ -90,7 +90,8 @@ def walls(count=2, reflectance=True):
     rng = torch.Generator().manual_seed(0)
     mask = torch.rand(count, 64, 32, generator=rng) < 0.8
     range_m = torch.where(mask, (2 + 90 * torch.rand(count, 1, 32, generator=rng)).expand(-1, 64, -1), 0)
-    return RangeImage(range_m, mask, SENSOR, torch.rand(count, 64, 32, generator=rng) * mask if reflectance else None)
+    planes = {"reflectance": torch.rand(count, 64, 32, generator=rng) * mask} if reflectance else {}
+    return RangeImage(range_m, mask, SENSOR, planes)
 
 
 def made(**settings):
@@ -257,7 +258,7 @@ def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tmp_path, content
 
 def test_ranges_are_encoded_as_published_and_come_back():
     sensor, images = load_sensor("hdl64e_kitti_360").with_columns(32), walls()
-    images = RangeImage(images.range_m.clamp(max=79.9), images.return_mask, sensor, images.reflectance)
+    images = RangeImage(images.range_m.clamp(max=79.9), images.return_mask, sensor, images.planes)
     encoded = encode(images, with_reflectance=True)
     assert bool((encoded[:, 0][~images.return_mask] == -1).all())
     near = RangeImage(torch.full((1, 64, 32), 1.45), torch.ones(1, 64, 32, dtype=torch.bool), sensor)
@@ -301,7 +302,7 @@ def test_a_completed_scan_keeps_what_was_observed():
         torch.where(observed, images.range_m, other.range_m),
         torch.where(observed, images.return_mask, other.return_mask),
         SENSOR,
-        torch.where(observed, images.reflectance, 0),
+        {"reflectance": torch.where(observed, images.reflectance, 0)},
     )
     again = generator.complete(Observed.of_pixels(hidden, observed), [0, 1], DiffusionSampling(steps=3, resamples=2))
     assert torch.equal(again.range_m, done.range_m)

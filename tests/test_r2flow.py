@@ -32,7 +32,8 @@ def walls(count=2, reflectance=True):
     rng = torch.Generator().manual_seed(0)
     mask = torch.rand(count, 64, 32, generator=rng) < 0.8
     range_m = torch.where(mask, (2 + 70 * torch.rand(count, 1, 32, generator=rng)).expand(-1, 64, -1), 0)
-    return RangeImage(range_m, mask, SENSOR, torch.rand(count, 64, 32, generator=rng) * mask if reflectance else None)
+    planes = {"reflectance": torch.rand(count, 64, 32, generator=rng) * mask} if reflectance else {}
+    return RangeImage(range_m, mask, SENSOR, planes)
 
 
 def made(**settings):

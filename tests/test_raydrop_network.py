@@ -32,7 +32,7 @@ def pairs(count: int) -> RangeImage:
     range_m = (20 + 15 * angle.cos()).expand(count, 64, 32)
     surface = torch.ones_like(range_m, dtype=torch.bool)
     surface[:, :8] = False
-    return RangeImage.masked(range_m, surface, SENSOR, (range_m < 20).float())
+    return RangeImage.masked(range_m, surface, SENSOR, {"reflectance": (range_m < 20).float()})
 
 
 def made(config: RaydropNetworkConfig = TINY) -> RaydropNetwork:
@@ -85,7 +85,7 @@ def test_ordinary_scans_are_refused_unless_surfaces_are_estimated():
     images, rng = pairs(2), torch.Generator().manual_seed(0)
     for reflectance in (None, torch.where(images.return_mask, 0.3, 0.0)):
         with pytest.raises(ConfigError, match="scans that do not mark which of their surfaces return"):
-            RaydropObjective(made(), SENSOR)(Example(replace(images, reflectance=reflectance)), rng)
+            RaydropObjective(made(), SENSOR)(Example(images.with_planes(reflectance=reflectance)), rng)
     terms = RaydropObjective(made(replace(TINY, surfaces="estimated")), SENSOR)(Example(images), rng)
     assert float(terms["loss"]) > 0
 

@@ -32,7 +32,7 @@ def noise(seed, count=6, drop_share=0.3):
     mask[0, 3] = False  # a row without any return
     mask[1, :3] = True
     hundredths = torch.randint(101, shape, generator=rng) / 100
-    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, torch.where(mask, hundredths, 0))
+    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, {"reflectance": torch.where(mask, hundredths, 0)})
 
 
 GENERATED, REAL = noise(0), noise(1, count=5, drop_share=0.5)

@@ -30,7 +30,7 @@ def scans(count: int) -> RangeImage:
     range_m = (20 + 10 * SENSOR.azimuth_rad.cos()).expand(count, 64, 32)
     mask = torch.rand(count, 64, 32, generator=rng) < 0.8
     bright = torch.linspace(0.9, 0.1, 32).expand(count, 64, 32)
-    return RangeImage.masked(range_m, mask, SENSOR, bright)
+    return RangeImage.masked(range_m, mask, SENSOR, {"reflectance": bright})
 
 
 def test_without_it_nothing_differs_and_with_it_two_layers_grow():
@@ -60,7 +60,7 @@ def test_it_is_learned(raydrop):
 
 
 def test_scans_without_it_are_refused():
-    vqvae, without = Vqvae(BOTH, SENSOR).eval(), replace(scans(1), reflectance=None)
+    vqvae, without = Vqvae(BOTH, SENSOR).eval(), scans(1).with_planes(reflectance=None)
     for work in (lambda: vqvae.encode(without), lambda: vqvae(Example(without), torch.Generator())):
         with pytest.raises(
             ConfigError, match=r"without reflectance, for a model of model\.tokenizer\.reflectance=true"

@@ -46,7 +46,7 @@ def streets(count: int) -> RangeImage:
     angle = SENSOR.azimuth_rad + 6 * torch.rand(count, 1, 1, generator=rng)
     range_m = (10 + 5 * angle.cos()).expand(count, 64, 32)
     bright = (0.5 + 0.3 * angle.cos() - torch.arange(64)[:, None] / 400).expand(count, 64, 32)
-    return RangeImage.masked(range_m, torch.rand(count, 64, 32, generator=rng) < 0.8, SENSOR, bright)
+    return RangeImage.masked(range_m, torch.rand(count, 64, 32, generator=rng) < 0.8, SENSOR, {"reflectance": bright})
 
 
 def reflectance_of(images: RangeImage) -> Tensor:
@@ -91,7 +91,9 @@ def test_marks_tell_every_hundredth_and_lost_returns_after_rounding():
 def test_triangles_interpolate_reflectance_within_surfaces_and_others_take_the_nearest():
     elevation = SENSOR.elevation_rad.expand(64, 32)
     bright = 0.5 + 0.5 * elevation
-    image = RangeImage.stack([RangeImage(torch.full((64, 32), 9.0), torch.ones(64, 32) > 0, SENSOR, bright)])
+    image = RangeImage.stack(
+        [RangeImage(torch.full((64, 32), 9.0), torch.ones(64, 32) > 0, SENSOR, {"reflectance": bright})]
+    )
     observed = torch.zeros(1, 64, 32, dtype=torch.bool)
     observed[:, ::3] = True
     known = Observed.of_pixels(image, observed)
@@ -101,7 +103,7 @@ def test_triangles_interpolate_reflectance_within_surfaces_and_others_take_the_n
     assert set(done["nearest"].unique().tolist()) == set(bright[::3].unique().tolist())
     range_m = torch.full((64, 32), 5.0)
     range_m[:, 16:] = 40.0
-    edge = RangeImage.stack([RangeImage(range_m, range_m > 0, SENSOR, range_m / 50)])
+    edge = RangeImage.stack([RangeImage(range_m, range_m > 0, SENSOR, {"reflectance": range_m / 50})])
     columns = torch.zeros(1, 64, 32, dtype=torch.bool)
     columns[:, :, ::3] = True
     filled = reflectance_of(fill("triangulation", Observed.of_pixels(edge, columns)))
@@ -112,7 +114,7 @@ def test_hints_tell_the_reflectance_of_the_next_return_on_every_side():
     range_m, bright = torch.zeros(1, 64, 32), torch.zeros(1, 64, 32)
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     bright[0, 10, 4], bright[0, 10, 30], bright[0, 20, 6] = 0.2, 0.4, 0.8
-    image = RangeImage(range_m, range_m > 0, SENSOR, bright)
+    image = RangeImage(range_m, range_m > 0, SENSOR, {"reflectance": bright})
     found = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.reflectances is not None
     assert found.reflectances[0, 1:, 10, 6].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.2, 0.4])
@@ -131,7 +133,7 @@ def test_the_loss_counts_hidden_returns_alone():
     observed = random_patterns(2, 64, 32, rng)
     known = Observed.of_pixels(images, observed)
     assert known.reflectance is not None
-    known = replace(known, reflectance=hidden_in_some(known.reflectance, TYPICAL_REFLECTANCE, 0.25, rng))
+    known = replace(known, planes={"reflectance": hidden_in_some(known.reflectance, TYPICAL_REFLECTANCE, 0.25, rng)})
     found = network(hints_of(known), observed).reflectance
     assert found is not None
     true, errors = reflectance_of(images), []
@@ -161,7 +163,7 @@ def test_it_learns_reflectance_and_begins_near_triangulation():
     errors = [terms["reflectance_error"] for terms in learn(objective, images, [0] * 12, 3e-3)]
     assert errors[-1] < 0.9 * errors[0]
     with pytest.raises(ConfigError, match=r"without reflectance, for a model of model\.completion\.reflectance=true"):
-        objective(Example(replace(images, reflectance=None)), torch.Generator())
+        objective(Example(images.with_planes(reflectance=None)), torch.Generator())
 
 
 @torch.no_grad()
@@ -195,7 +197,7 @@ def test_observed_reflectance_is_kept_bit_for_bit_and_scans_without_it_get_none(
     assert torch.equal(done[observed], images.reflectance[observed])
     assert 0 <= float(done.min()) <= float(done.max()) <= 1
     assert bool((done[~observed] > 0).any())
-    assert model.complete(every_fourth_row(replace(images, reflectance=None)), [3, 4]).reflectance is None
+    assert model.complete(every_fourth_row(images.with_planes(reflectance=None)), [3, 4]).reflectance is None
     plain = load(folders / "plain").complete(known, [3, 4]).reflectance
     assert plain is not None
     assert torch.equal(plain[observed], images.reflectance[observed])
@@ -206,7 +208,7 @@ def test_raydrop_learns_reflectance_from_marks():
     images = streets(3)
     assert images.reflectance is not None
     returned = images.return_mask & (torch.arange(32) % 3 > 0)
-    marked = replace(images, reflectance=mark(returned, images.reflectance))
+    marked = images.with_planes(reflectance=mark(returned, images.reflectance))
     objective = RaydropObjective(RaydropNetwork(RAYDROP, SENSOR), SENSOR).eval()
     rng = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -217,11 +219,11 @@ def test_raydrop_learns_reflectance_from_marks():
     learned = [terms["reflectance_error"] for terms in learn(objective.train(), marked, range(12), 1e-2)]
     assert learned[-1] < 0.8 * learned[0]
     with pytest.raises(ConfigError, match=r"without their reflectance, for model\.raydrop\.reflectance=true"):
-        objective(Example(replace(images, reflectance=returned.float())), rng)
+        objective(Example(images.with_planes(reflectance=returned.float())), rng)
     plain = RaydropObjective(RaydropNetwork(replace(RAYDROP, reflectance=False), SENSOR), SENSOR).eval()
     with torch.no_grad():  # files that mark returns alone are the same to a network without reflectance
         by_marks, bare = (
-            plain(Example(replace(images, reflectance=marks)), torch.Generator().manual_seed(0))
+            plain(Example(images.with_planes(reflectance=marks)), torch.Generator().manual_seed(0))
             for marks in (marked.reflectance, returned.float())
         )
     assert by_marks["loss"] == bare["loss"]
@@ -271,7 +273,7 @@ def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tm
 def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(folders):
     model, scans = load(folders / "plain"), streets(2)
     label = torch.where(scans.return_mask, torch.where(torch.arange(64)[:, None] < 32, 40, 50), 0)
-    scans, observed = replace(scans, label=label), torch.zeros(2, 64, 32, dtype=torch.bool)
+    scans, observed = scans.with_planes(label=label), torch.zeros(2, 64, 32, dtype=torch.bool)
     observed[:, ::4] = True
     known = Observed.of_pixels(scans, observed)
     done = model.complete(known, [3, 4], TokenSampling())
@@ -286,12 +288,12 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
     assert torch.equal(reflectance_of(done)[both], reflectance_of(classical)[both])
     assert torch.equal(done.label[both], classical.label[both])
     assert not bool(reflectance_of(done)[~done.return_mask].any())
-    bare = model.complete(replace(known, reflectance=None, label=None), [3, 4], TokenSampling())
+    bare = model.complete(replace(known, planes={}), [3, 4], TokenSampling())
     assert bare.reflectance is None
     assert bare.label is None
     assert torch.equal(bare.range_m, done.range_m)
     none = torch.zeros_like(scans.return_mask[1:])
-    lost = RangeImage.masked(scans.range_m[1:], none, SENSOR, reflectance_of(scans)[1:], scans.label[1:])
+    lost = RangeImage.masked(scans.range_m[1:], none, SENSOR, scans[1:].planes)
     mixed = Observed.of_pixels(RangeImage.cat([scans[:1], lost]), observed)
     alone, together = model.complete(mixed[1:2], [4]), model.complete(mixed, [3, 4])
     assert not bool(reflectance_of(alone).any()), "no observed pixel returned"

@@ -24,6 +24,7 @@ from lidargrit.data.prepared.prepare import prepare, prepare_and_describe
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.data.prepared.workers import make_some_shards
 from lidargrit.data.sources import open_source
+from lidargrit.data.sources.samples import read_samples
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.fit_sensor import fit_sensor
 from lidargrit.scans.sensors import load_sensor
@@ -336,3 +337,15 @@ def test_compress_says_once_what_it_does_not_keep(kitti, tmp_path, capsys):
     words = ["compress", str(kitti), str(tmp_path / "scans.lgz"), "--model", str(tmp_path / "run")]
     assert main(words) == 0
     assert capsys.readouterr().err.count(".lgz keeps no reflectance\n") == 1
+
+
+def test_a_sample_that_lacks_the_reflectance_of_those_beside_it_is_not_read_without_a_word(tmp_path):
+    (tmp_path / "samples.json").write_text(json.dumps({"sensor": K360.with_columns(32).to_json()}))
+    pixels = np.full((64, 32), 5, np.float32)
+    for seed in range(3):
+        more = {} if seed == 2 else {"reflectance": pixels / 10}
+        np.savez(tmp_path / f"{seed:08d}.npz", range_m=pixels, **more)
+    images = read_samples(tmp_path)
+    assert images.batch([0, 1]).reflectance is not None
+    with pytest.raises(DataError, match=r"sample 00000002 without reflectance; wanted what the first"):
+        images.batch([1, 2])

@@ -17,7 +17,7 @@ def street(poles):
     for kind, column, columns, rows in poles:
         pixels = (0, slice(10, 10 + rows), slice(column, column + columns))
         range_m[pixels], label[pixels] = 10.0, kind
-    return RangeImage(range_m, range_m > 0, SENSOR, label=label)
+    return RangeImage(range_m, range_m > 0, SENSOR, {"label": label})
 
 
 def test_poles_and_trunks_are_upright_objects_and_nothing_else_is():

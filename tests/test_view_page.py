@@ -5,7 +5,6 @@ import gzip
 import json
 import re
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +37,7 @@ def scans(sensor=SENSOR, count=3, seed=0) -> RangeImage:
         range_m = torch.where(down > 0, 1.73 / down.clamp(min=1e-3), 1000.0).minimum(wall_m)
         returned = torch.rand(range_m.shape, generator=rng) < 0.85
         reflectance = torch.rand(range_m.shape, generator=rng) * returned
-        images.append(RangeImage(range_m * returned, returned, sensor, reflectance))
+        images.append(RangeImage(range_m * returned, returned, sensor, {"reflectance": reflectance}))
     return RangeImage.stack(images)
 
 
@@ -53,7 +52,7 @@ def shown() -> list[ScanSet]:
     real, other = scans(), scans(seed=1)
     plain = RangeImage(other.range_m, other.return_mask, SENSOR)  # as a generator without reflectance draws
     return [
-        ScanSet("real </script>", replace(real, label=labels(real)), NAMES),
+        ScanSet("real </script>", real.with_planes(label=labels(real)), NAMES),
         ScanSet("generated", plain[:2], ("seed 0", "seed 1")),
     ]
 

@@ -163,14 +163,14 @@ def test_features_are_what_the_last_layer_reads(precision):
 def test_batches_are_joined_with_reflectance_only_if_all_have_it():
     sensor = sensor_of(16, 32)
     plain = images_of(sensor, 2)
-    shiny = replace(images_of(sensor, 3, seed=1), reflectance=torch.rand(3, 16, 32))
+    shiny = images_of(sensor, 3, seed=1).with_planes(reflectance=torch.rand(3, 16, 32))
     both = RangeImage.cat([plain, shiny])
     assert torch.equal(both.range_m, torch.cat((plain.range_m, shiny.range_m)))
     assert both.reflectance is None
     twice = RangeImage.cat([shiny, shiny[:1]])
     assert twice.reflectance is not None
     assert torch.equal(twice[3].range_m, shiny[0].range_m)
-    masked = RangeImage.masked(shiny.range_m + 1, shiny.return_mask, sensor, shiny.reflectance)
+    masked = RangeImage.masked(shiny.range_m + 1, shiny.return_mask, sensor, shiny.planes)
     assert masked.reflectance is not None
     assert float(masked.reflectance[~masked.return_mask].abs().max()) == 0
 

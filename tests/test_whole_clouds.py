@@ -120,7 +120,7 @@ def test_the_first_image_of_a_cloud_is_what_the_model_makes_of_it_alone():
     grid = RayGrid.fitting(DENSE, 128)
     task = Fill(Pattern("rows:4"))
     seen = task.see(unproject(fine), model)
-    alone = RangeImage(fine.range_m[:, ::4], fine.return_mask[:, ::4], DENSE, fine.reflectance[:, ::4])
+    alone = RangeImage(fine.range_m[:, ::4], fine.return_mask[:, ::4], DENSE, {"reflectance": fine.reflectance[:, ::4]})
     condition = task.condition(seen, 0)
     found, wanted = condition.images.range_m[0], alone.range_m * condition.return_observed[0]
     assert torch.allclose(found, wanted, rtol=1e-6)

@@ -76,7 +76,7 @@ class ToyTokenizer(Tokenizer[ToyConfig]):
         images = super().sample(tokens, rngs, mask)
         noise = torch.stack([torch.randn(images.range_m.shape[1:], generator=rng) for rng in rngs])
         range_m = (images.range_m + self.config.noise_m * noise).clamp(self.sensor.range_min_m, self.sensor.range_max_m)
-        return RangeImage.masked(range_m, images.return_mask, self.sensor, images.reflectance)
+        return RangeImage.masked(range_m, images.return_mask, self.sensor, images.planes)
 
     def decoding_flops(self) -> int:
         """Return 0: nothing is multiplied."""

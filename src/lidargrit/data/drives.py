@@ -81,7 +81,8 @@ def write_drives(
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
     The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
-    lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's own tools look there.
+    lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's own tools look there. Streets that are
+    seen once each are no drive: they have no times.
 
     Args:
         out: an empty folder, or a folder that the same simulation began; scans can be added to it.
@@ -202,7 +203,8 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
         lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
         write_text(out / "poses" / f"{sequence}.txt", lines)
         write_text(folder / "poses.txt", lines)
-        write_text(folder / "times.txt", "".join(f"{number * FRAME_S:e}\n" for number in range(len(relative))))
+        if config.frames > 1:
+            write_text(folder / "times.txt", "".join(f"{number * FRAME_S:e}\n" for number in range(len(relative))))
         write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
 
 

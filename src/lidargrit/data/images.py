@@ -1,16 +1,19 @@
 """Range images on disk → batches in memory, of only the images that are asked for."""
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
+from types import MappingProxyType
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt16
+from jaxtyping import Float32, Shaped
 
+from lidargrit.core.errors import DataError
+from lidargrit.scans.planes import PLANES
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -19,12 +22,11 @@ class Pixels(NamedTuple):
     """The pixels of one image.
 
     Args:
-        label: class by SemanticKITTI's numbers, 0 where it is not known; None if it is not known anywhere.
+        planes: further planes that are known, by names of :data:`~lidargrit.scans.planes.PLANES`.
     """
 
     range_m: Float32[np.ndarray, "H W"]
-    reflectance: Float32[np.ndarray, "H W"] | None = None
-    label: UInt16[np.ndarray, "H W"] | None = None
+    planes: Mapping[str, Shaped[np.ndarray, "H W"]] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -108,13 +110,9 @@ class RangeImages:
         )
 
     @cached_property
-    def _all_have_reflectance(self) -> bool:
-        """Whether the first image of every store has reflectance; batches with it and without it would not mix."""
-        return all(store.read(0).reflectance is not None for store in self._stores)
-
-    @cached_property
-    def _all_have_label(self) -> bool:
-        return all(store.read(0).label is not None for store in self._stores)
+    def _planes(self) -> frozenset[str]:
+        """Planes that the first image of every store has, and so all images must have that are read."""
+        return frozenset.intersection(*(frozenset(store.read(0).planes) for store in self._stores))
 
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
         """Return some images as one batch (B, H, W).
@@ -127,18 +125,19 @@ class RangeImages:
         first_columns = first_columns or [0] * len(indices)
         pixels = [self._pixels(index, first) for index, first in zip(indices, first_columns, strict=True)]
         range_m = torch.from_numpy(np.stack([one.range_m for one in pixels]))
-        reflectance, label = (
-            torch.from_numpy(np.stack(found)) if found and len(found) == len(pixels) else None
-            for found in (
-                [one.reflectance for one in pixels if one.reflectance is not None and self._all_have_reflectance],
-                [one.label.astype(np.int64) for one in pixels if one.label is not None and self._all_have_label],
-            )
-        )
-        return RangeImage(range_m, range_m > 0, self.sensor, reflectance, label)
+        planes = {
+            name: torch.from_numpy(np.stack([one.planes[name] for one in pixels]).astype(PLANES[name].dtype))
+            for name in sorted(self._planes)
+        }
+        return RangeImage(range_m, range_m > 0, self.sensor, planes)
 
     def _pixels(self, index: int, first_column: int) -> Pixels:
         part = bisect_right(self._ends, index)
-        whole = self._stores[part].read(index - (self._ends[part - 1] if part else 0))
+        store, number = self._stores[part], index - (self._ends[part - 1] if part else 0)
+        whole = store.read(number)
+        if lacking := self._planes - whole.planes.keys():
+            names = store.provenance.names
+            got = f"{names[number] if names else f'image {number}'} without {' and '.join(sorted(lacking))}"
+            raise DataError(got, "what the first image beside it has", "remove it, or make all of them alike")
         kept = slice(first_column, None, whole.range_m.shape[1] // self.sensor.width)
-        reflectance, label = (None if one is None else one[:, kept] for one in whole[1:])
-        return Pixels(whole.range_m[:, kept], reflectance, label)
+        return Pixels(whole.range_m[:, kept], {name: whole.planes[name][:, kept] for name in self._planes})

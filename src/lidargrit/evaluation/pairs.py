@@ -55,7 +55,7 @@ class EvalSet:
             return images
         near, far = self.range_m
         mask = (images.range_m > near) & (images.range_m < far)
-        return RangeImage.masked(images.range_m, mask, images.sensor, images.reflectance, images.label)
+        return RangeImage.masked(images.range_m, mask, images.sensor, images.planes)
 
     def record(self) -> EvalSetRecord:
         """Return the entry of the set in a score file; its hash is of the ranges before limits are applied."""

@@ -120,7 +120,7 @@ def drop_independently(clean: RangeImage, return_share: float) -> RangeImage:
     rng = torch.Generator().manual_seed(0)
     keep = return_share / max(float(clean.return_mask.float().mean()), 1e-9)
     mask = clean.return_mask & (torch.rand(clean.range_m.shape, generator=rng) < keep)
-    return RangeImage.masked(clean.range_m, mask, clean.sensor, clean.reflectance, clean.label)
+    return RangeImage.masked(clean.range_m, mask, clean.sensor, clean.planes)
 
 
 def scans_of_both(
@@ -185,9 +185,10 @@ def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeIm
     range_m = torch.from_numpy(np.where(seen.return_mask, seen.range_m, seen.clean_range_m))
     within = (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m) & torch.from_numpy(~seen.blocked)
     reflectance, label = torch.from_numpy(seen.reflectance), torch.from_numpy(seen.label.astype(np.int64))
+    planes = {"reflectance": reflectance, "label": label}
 
     def image(mask: torch.Tensor) -> RangeImage:
-        return RangeImage.masked(range_m, mask, sensor, reflectance, label)
+        return RangeImage.masked(range_m, mask, sensor, planes)
 
     return image(within), image(within & torch.from_numpy(seen.return_mask))
 

@@ -1,7 +1,6 @@
 """Range images ⇄ log ranges in [-1, 1], beside them reflectance; no return is a level below that of every return."""
 
 import math
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -51,4 +50,4 @@ def decode(
     image = RangeImage.masked(range_m.clamp(sensor.range_min_m, sensor.range_max_m), returned, sensor)
     if values.shape[1] == 1:
         return image
-    return replace(image, reflectance=((values[:, 1] + 1) / 2).clamp(0, 1) * returned)
+    return image.with_planes(reflectance=((values[:, 1] + 1) / 2).clamp(0, 1) * returned)

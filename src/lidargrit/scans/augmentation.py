@@ -102,15 +102,9 @@ def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float
 
 
 def _pick(chosen: Tensor, changed: RangeImage, images: RangeImage) -> RangeImage:
-    reflectance, label = None, None
-    if changed.reflectance is not None and images.reflectance is not None:
-        reflectance = torch.where(chosen, changed.reflectance, images.reflectance)
-    if changed.label is not None and images.label is not None:
-        label = torch.where(chosen, changed.label, images.label)
     return replace(
         images,
         range_m=torch.where(chosen, changed.range_m, images.range_m),
         return_mask=torch.where(chosen, changed.return_mask, images.return_mask),
-        reflectance=reflectance,
-        label=label,
+        planes={name: torch.where(chosen, changed.planes[name], pixels) for name, pixels in images.planes.items()},
     )

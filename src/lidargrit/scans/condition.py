@@ -1,15 +1,16 @@
 """What is known of scans that are to be generated: nothing, or range images and masks → :class:`Observed`."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.planes import checked_planes, common_planes
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, sensor_of_all
 
@@ -78,12 +79,10 @@ class Observed(Condition):
         return_mask: True where the beam came back.
         return_observed: True where it is known whether the beam came back.
         sensor: sensor whose rays the pixels are.
-        reflectance: reflectance in [0, 1] of the observed returns, kept in 32 bits; None if it is not known.
-        label: class of the surface by SemanticKITTI's numbers, 0 where it is not known; None if it is not known
-            anywhere.
+        planes: further planes of the observed surfaces or returns, by names of :data:`~lidargrit.scans.types.PLANES`.
 
     Raises:
-        ConfigError: masks of another size or type than the ranges, labels that are no whole numbers, or no batch.
+        ConfigError: masks or planes of another size or type than the ranges, or no batch.
         ScanError: an observed range that is not positive and finite, an observed return without a range, or its
             reflectance outside [0, 1].
     """
@@ -93,23 +92,17 @@ class Observed(Condition):
     return_mask: Bool[Tensor, "B H W"]
     return_observed: Bool[Tensor, "B H W"]
     sensor: SensorModel
-    reflectance: Float[Tensor, "B H W"] | None = None
-    label: Int[Tensor, "B H W"] | None = None
+    planes: Mapping[str, Shaped[Tensor, "B H W"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_mask(self.range_observed, self.range_m)
         _check_mask(self.return_observed, self.range_m)
         _check_mask(self.return_mask, self.range_m, "a mask of returns")
         object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
-        if self.reflectance is not None:
-            object.__setattr__(self, "reflectance", self.reflectance.float())
         size = (len(self.range_m), self.sensor.height, self.sensor.width)
-        for name in ("range_m", "reflectance", "label"):
-            pixels: Tensor | None = getattr(self, name)
-            if pixels is not None and pixels.shape != size:
-                raise ConfigError(f"{name} of {tuple(pixels.shape)}", f"{size}, of the sensor", "give all one shape")
-        if self.label is not None and (self.label.is_floating_point() or self.label.dtype == torch.bool):
-            raise ConfigError(f"labels of type {self.label.dtype}", "whole numbers", "make them of type torch.int32")
+        if self.range_m.shape != size:
+            raise ConfigError(f"range_m of {tuple(self.range_m.shape)}", f"{size}, of the sensor", "give all one shape")
+        object.__setattr__(self, "planes", checked_planes(self.planes, self.range_m.shape))
         range_m = self.range_m[self.range_observed]
         if not bool(((range_m > 0) & range_m.isfinite()).all()):
             raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
@@ -131,10 +124,8 @@ class Observed(Condition):
         """
         _check_mask(observed, images.range_m)
         returned = images.return_mask & observed
-        range_m = torch.where(returned, images.range_m, 0.0)
-        reflectance = None if images.reflectance is None else torch.where(returned, images.reflectance, 0.0)
-        label = None if images.label is None else torch.where(returned, images.label, 0)
-        return cls(range_m, returned, returned, observed, images.sensor, reflectance, label)
+        seen = RangeImage.masked(images.range_m, returned, images.sensor, images.planes)
+        return cls(seen.range_m, returned, returned, observed, images.sensor, seen.planes)
 
     @classmethod
     def of_surfaces(cls, clean: RangeImage, unknown: Bool[Tensor, "B H W"] | None = None) -> "Observed":
@@ -147,8 +138,8 @@ class Observed(Condition):
         unknown = torch.zeros_like(clean.return_mask) if unknown is None else unknown
         _check_mask(unknown, clean.range_m, "unknown pixels")
         hit = clean.return_mask & ~unknown
-        label = None if clean.label is None else torch.where(hit, clean.label, 0)
-        return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, label=label)
+        planes = {} if clean.label is None else {"label": torch.where(hit, clean.label, 0)}
+        return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, planes)
 
     @classmethod
     def nothing(cls, sensor: SensorModel, count: int) -> "Observed":
@@ -158,17 +149,14 @@ class Observed(Condition):
 
     @classmethod
     def cat(cls: type[ObservedT], parts: Sequence[ObservedT]) -> ObservedT:
-        """Return the conditions of several batches as one; reflectance and label are kept if every batch has them."""
-        reflectance = [one.reflectance for one in parts if one.reflectance is not None]
-        label = [one.label for one in parts if one.label is not None]
+        """Return the conditions of several batches as one; a plane is kept if every batch has it."""
         return cls(
             torch.cat([one.range_m for one in parts]),
             torch.cat([one.range_observed for one in parts]),
             torch.cat([one.return_mask for one in parts]),
             torch.cat([one.return_observed for one in parts]),
             sensor_of_all([one.sensor for one in parts]),
-            torch.cat(reflectance) if len(reflectance) == len(parts) else None,
-            torch.cat(label) if len(label) == len(parts) else None,
+            common_planes([one.planes for one in parts], torch.cat),
         )
 
     def __len__(self) -> int:
@@ -189,9 +177,18 @@ class Observed(Condition):
             range_observed=change(self.range_observed),
             return_mask=change(self.return_mask),
             return_observed=change(self.return_observed),
-            reflectance=None if self.reflectance is None else change(self.reflectance),
-            label=None if self.label is None else change(self.label),
+            planes={name: change(pixels) for name, pixels in self.planes.items()},
         )
+
+    @property
+    def reflectance(self) -> Float[Tensor, "B H W"] | None:
+        """Reflectance in [0, 1] of the observed returns; None if it is not known."""
+        return self.planes.get("reflectance")
+
+    @property
+    def label(self) -> Int[Tensor, "B H W"] | None:
+        """Class of the surface by SemanticKITTI's numbers, 0 where it is not known; None if no class is known."""
+        return self.planes.get("label")
 
     @property
     def kinds(self) -> frozenset[ConditionKind]:
@@ -211,12 +208,12 @@ class Observed(Condition):
     def images(self) -> RangeImage:
         """The observed returns as range images, without a return in all other pixels."""
         kept = self.return_mask & self.return_observed
-        return RangeImage.masked(self.range_m, kept, self.sensor, self.reflectance, self.label)
+        return RangeImage.masked(self.range_m, kept, self.sensor, self.planes)
 
     @property
     def surfaces(self) -> RangeImage:
         """Range images in which every surface of known range returns."""
-        return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.reflectance, self.label)
+        return RangeImage.masked(self.range_m, self.range_observed, self.sensor, self.planes)
 
     def put_into(self, generated: RangeImage) -> RangeImage:
         """Return generated scans in which all observed values are put in, bit for bit.
@@ -225,15 +222,15 @@ class Observed(Condition):
         """
         returned = torch.where(self.return_observed, self.return_mask, generated.return_mask)
         range_m = torch.where(self.range_observed, self.range_m, generated.range_m)
-        reflectance, label = None, None
-        observed = self.return_observed & self.return_mask
-        if generated.reflectance is not None and self.reflectance is not None:
-            reflectance = torch.where(observed, self.reflectance, generated.reflectance)
-        elif not bool(observed.any()):
-            reflectance = generated.reflectance
-        if generated.label is not None and self.label is not None:
-            label = torch.where(self.range_observed, self.label, generated.label)
-        return RangeImage.masked(range_m, returned, self.sensor, reflectance, label)
+        observed = {"reflectance": self.return_observed & self.return_mask, "label": self.range_observed}
+        planes = {
+            name: torch.where(observed[name], self.planes[name], pixels)
+            for name, pixels in generated.planes.items()
+            if name in self.planes
+        }
+        if generated.reflectance is not None and not bool(observed["reflectance"].any()):
+            planes.setdefault("reflectance", generated.reflectance)
+        return RangeImage.masked(range_m, returned, self.sensor, planes)
 
 
 def _check_mask(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:

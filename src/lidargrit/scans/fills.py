@@ -224,13 +224,14 @@ def fill_lacking(completed: RangeImage, condition: Observed) -> RangeImage:
     if not (lacks_reflectance or lacks_labels):
         return completed
     scans = [SeenScan.of(condition, index) for index in range(len(condition))]
-    range_m, reflectance, label = completed.range_m, completed.reflectance, completed.label
+    range_m, planes = completed.range_m, dict(completed.planes)
     if lacks_reflectance:
         found = [_reflectance_of(condition, index, seen, of_triangle) for index, seen in enumerate(scans)]
-        reflectance = torch.stack(found).to(range_m.device)
+        planes["reflectance"] = torch.stack(found).to(range_m.device)
     if lacks_labels:
-        label = torch.stack([_label_of(condition, index, seen) for index, seen in enumerate(scans)]).to(range_m.device)
-    return RangeImage.masked(range_m, completed.return_mask, completed.sensor, reflectance, label)
+        found = [_label_of(condition, index, seen) for index, seen in enumerate(scans)]
+        planes["label"] = torch.stack(found).to(range_m.device)
+    return RangeImage.masked(range_m, completed.return_mask, completed.sensor, planes)
 
 
 def fill(method: str, condition: Observed) -> RangeImage:
@@ -254,8 +255,8 @@ def fill(method: str, condition: Observed) -> RangeImage:
             reflectances.append(_reflectance_of(condition, index, seen, by.reflectance))
         if condition.label is not None:
             labels.append(_label_of(condition, index, seen))
-    reflectance, label = (torch.stack(found) if found else None for found in (reflectances, labels))
-    filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, reflectance, label)
+    planes = {name: torch.stack(found) for name, found in (("reflectance", reflectances), ("label", labels)) if found}
+    filled = RangeImage.masked(torch.stack(ranges), torch.stack(masks), sensor, planes)
     return condition.to("cpu").put_into(filled)
 
 
@@ -294,7 +295,8 @@ def fill_from_nearest(images: RangeImage, observed: Bool[Tensor, "B H W"]) -> Ra
         rows, columns = (torch.from_numpy(part) for part in _nearest(mask.numpy(), elevation_rad))
         filled.append(pixels[:, rows, columns] if bool(mask.any()) else torch.zeros_like(pixels))
     range_m, *reflectance = torch.stack(filled).to(images.range_m.device).unbind(1)
-    return RangeImage(range_m, range_m > 0, images.sensor, reflectance[0] if reflectance else None)
+    planes = {"reflectance": reflectance[0]} if reflectance else {}
+    return RangeImage(range_m, range_m > 0, images.sensor, planes)
 
 
 def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:

@@ -1,20 +1,17 @@
-"""The data types that packages pass to one another: scan, range image, token grid, decoded scans, metric result.
-
-Each is valid once it exists. Ranges are always metres and the return mask is always True = a return. Normalised
-tensors live inside one model.
-"""
+"""The data types that packages pass to one another; ranges are metres, and a return mask is True = a return."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.file_rows import FileRows
+from lidargrit.scans.planes import NO_PLANES, PLANES, checked_planes, common_planes, planes_of
 from lidargrit.scans.sensors import SensorModel
 
 TYPICAL_LOG_RANGE = 2.5  # ln(1 + range in metres) in the middle of what scans hold: subtracted, inputs are near 0
@@ -39,6 +36,8 @@ class Scan:
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
         filled: True for points that a model added to the measured ones; None where none did.
         rows: rows of the file that the points were read from; None where the format keeps none.
+        time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
+        pose: matrix from the sensor's frame to that of the recording, kept in 64 bits; None if it is not known.
 
     Raises:
         ScanError: no point, a coordinate that is not finite, a point at the origin, or a reflectance outside [0, 1].
@@ -53,6 +52,8 @@ class Scan:
     notes: tuple[str, ...] = ()
     filled: Bool[Tensor, "n"] | None = None
     rows: FileRows | None = None
+    time_s: float | None = None
+    pose: Float64[Tensor, "4 4"] | None = None
 
     def __post_init__(self) -> None:
         if len(self) == 0:
@@ -118,25 +119,20 @@ class RangeImage:
         range_m: Euclidean distance to the return, in metres, kept in 32 bits; 0 where there is none.
         return_mask: whether the beam came back.
         sensor: sensor whose rays the pixels are.
-        reflectance: reflectance of the return, in [0, 1], kept in 32 bits; 0 where there is none.
-        label: class of what returned by SemanticKITTI's numbers, without its instance; 0 where there is no return or
-            the class is not known.
+        planes: further planes of pixels that are known, by names of :data:`PLANES`.
 
     Raises:
         ScanError: a range that is not finite, not positive on a return, or not 0 elsewhere.
-        ConfigError: an image whose size is not the sensor's.
+        ConfigError: an image whose size is not the sensor's, or a plane of another name, size or type.
     """
 
     range_m: Float[Tensor, "*batch H W"]
     return_mask: Bool[Tensor, "*batch H W"]
     sensor: SensorModel
-    reflectance: Float[Tensor, "*batch H W"] | None = None
-    label: Int[Tensor, "*batch H W"] | None = None
+    planes: Mapping[str, Shaped[Tensor, "*batch H W"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
-        if self.reflectance is not None:
-            object.__setattr__(self, "reflectance", self.reflectance.float())
         size = tuple(self.range_m.shape[-2:])
         if size != (self.sensor.height, self.sensor.width):
             raise ConfigError(
@@ -144,14 +140,10 @@ class RangeImage:
                 f"the {self.sensor.height}x{self.sensor.width} of the sensor {self.sensor.name!r}",
                 "use the sensor's own size, or sensor.with_columns(...)",
             )
-        for name in ("return_mask", "reflectance", "label"):
-            pixels: Tensor | None = getattr(self, name)
-            if pixels is not None and pixels.shape != self.range_m.shape:
-                raise ConfigError(
-                    f"{name} of {tuple(pixels.shape)}",
-                    f"the {tuple(self.range_m.shape)} of range_m",
-                    "give all one shape",
-                )
+        if self.return_mask.shape != self.range_m.shape:
+            wanted = f"the {tuple(self.range_m.shape)} of range_m"
+            raise ConfigError(f"return_mask of {tuple(self.return_mask.shape)}", wanted, "give all one shape")
+        object.__setattr__(self, "planes", checked_planes(self.planes, self.range_m.shape))
         if not self._is_valid():
             valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
             raise ScanError(
@@ -173,35 +165,47 @@ class RangeImage:
         range_m: Float[Tensor, "*batch H W"],
         return_mask: Bool[Tensor, "*batch H W"],
         sensor: SensorModel,
-        reflectance: Float[Tensor, "*batch H W"] | None = None,
-        label: Int[Tensor, "*batch H W"] | None = None,
+        planes: Mapping[str, Shaped[Tensor, "*batch H W"]] = NO_PLANES,
     ) -> "RangeImage":
-        """Make a range image of a clean range and a mask: whatever else it has is set to 0 where nothing returned."""
-        kept = None if reflectance is None else torch.where(return_mask, reflectance, 0.0)
-        classes = None if label is None else torch.where(return_mask, label, 0)
-        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept, classes)
+        """Make a range image of a clean range and a mask: planes of returns are set to 0 where nothing returned."""
+        kept = {
+            name: torch.where(return_mask, pixels, 0) if PLANES[name].of_returns else pixels
+            for name, pixels in planes.items()
+        }
+        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept)
 
     @classmethod
     def stack(cls, images: "Sequence[RangeImage]") -> "RangeImage":
-        """Make one batch of single images of one sensor; reflectance and label are kept if every image has them."""
+        """Make one batch of single images of one sensor; a plane is kept if every image has it."""
         return cls._joined(images, torch.stack)
 
     @classmethod
     def cat(cls, batches: "Sequence[RangeImage]") -> "RangeImage":
-        """Make one batch of several batches of one sensor; reflectance and label are kept if every batch has them."""
+        """Make one batch of several batches of one sensor; a plane is kept if every batch has it."""
         return cls._joined(batches, torch.cat)
 
     @classmethod
     def _joined(cls, images: "Sequence[RangeImage]", join: Callable[[list[Tensor]], Tensor]) -> "RangeImage":
-        reflectance = [image.reflectance for image in images if image.reflectance is not None]
-        label = [image.label for image in images if image.label is not None]
         return cls(
             join([image.range_m for image in images]),
             join([image.return_mask for image in images]),
             sensor_of_all([image.sensor for image in images]),
-            join(reflectance) if len(reflectance) == len(images) else None,
-            join(label) if len(label) == len(images) else None,
+            common_planes([image.planes for image in images], join),
         )
+
+    @property
+    def reflectance(self) -> Float[Tensor, "*batch H W"] | None:
+        """Reflectance of the return, in [0, 1]; 0 where there is none. None if it is not known."""
+        return self.planes.get("reflectance")
+
+    @property
+    def label(self) -> Int[Tensor, "*batch H W"] | None:
+        """Class of what returned by SemanticKITTI's numbers, 0 where there is none; None if no class is known."""
+        return self.planes.get("label")
+
+    def with_planes(self, **changed: Shaped[Tensor, "*batch H W"] | None) -> "RangeImage":
+        """Return the image with some of its planes changed, by name, or taken away by None."""
+        return replace(self, planes=planes_of(**{**self.planes, **changed}))
 
     def __len__(self) -> int:
         return self.range_m.shape[0] if self.range_m.ndim > 2 else 1
@@ -220,8 +224,7 @@ class RangeImage:
             self,
             range_m=change(self.range_m),
             return_mask=change(self.return_mask),
-            reflectance=None if self.reflectance is None else change(self.reflectance),
-            label=None if self.label is None else change(self.label),
+            planes={name: change(pixels) for name, pixels in self.planes.items()},
         )
 
 
@@ -296,7 +299,7 @@ class Decoded:
         return self._masked(uniform.to(self.return_logits.device) < self.return_logits.sigmoid())
 
     def _masked(self, return_mask: Bool[Tensor, "B H W"]) -> RangeImage:
-        return RangeImage.masked(self.range_m, return_mask, self.sensor, self.reflectance)
+        return RangeImage.masked(self.range_m, return_mask, self.sensor, planes_of(reflectance=self.reflectance))
 
 
 @dataclass(frozen=True, eq=False)

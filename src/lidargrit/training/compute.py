@@ -199,7 +199,7 @@ def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
     """
     range_m = torch.full((count, sensor.height, sensor.width), 10.0).clamp(sensor.range_min_m, sensor.range_max_m)
     mask, label = torch.ones_like(range_m, dtype=torch.bool), torch.full(range_m.shape, 40)
-    return RangeImage(range_m, mask, sensor, torch.full_like(range_m, 0.65), label)
+    return RangeImage(range_m, mask, sensor, {"reflectance": torch.full_like(range_m, 0.65), "label": label})
 
 
 def _uniform_examples(preset: Preset, sensor: SensorModel) -> Example:

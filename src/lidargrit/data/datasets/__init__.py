@@ -4,13 +4,16 @@ import re
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
+
+from jaxtyping import Float64
+from torch import Tensor
 
 from lidargrit.core import discovery
-from lidargrit.core.errors import DataError, printable
+from lidargrit.core.errors import ConfigError, DataError, printable
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
@@ -34,6 +37,18 @@ class SplitScheme:
     source: str
     leak: str
     parts: Mapping[str, tuple[str, ...]]
+
+
+class Motion(NamedTuple):
+    """When and where a scan was made.
+
+    Args:
+        time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
+        pose: matrix from the sensor's frame to that of the recording; None if it is not known.
+    """
+
+    time_s: float | None = None
+    pose: Float64[Tensor, "4 4"] | None = None
 
 
 class ScanDataset(ABC):
@@ -108,6 +123,41 @@ class ScanDataset(ABC):
         """Name the recording that a scan was cut from, the same in every data set that has it; "" if it is alone."""
         return ""
 
+    def motion(self, index: int) -> Motion:
+        """Return when and where a scan was made, as far as files beside it tell.
+
+        Raises:
+            DataError: such a file is damaged.
+        """
+        return Motion()
+
+    def windows(self, frames: int) -> "list[Window]":
+        """Return all runs of scans that follow one another in one recording, in order of time.
+
+        Each run begins one scan after the one before it. Scans whose time is not known are in none. Where a recording
+        lacks scans, those around the gap follow one another, as their times tell.
+
+        Args:
+            frames: number of scans in each run.
+
+        Raises:
+            ConfigError: a number below 1.
+            DataError: a file of times or poses that is damaged.
+        """
+        if frames < 1:
+            raise ConfigError(f"windows of {frames} scans", "at least 1", "correct it")
+        drives: dict[str, list[tuple[float, int]]] = {}
+        for index in range(len(self)):
+            time_s = self.motion(index).time_s
+            if time_s is not None:
+                drives.setdefault(self.recording(index), []).append((time_s, index))
+        ordered = [[index for _, index in sorted(drive)] for drive in drives.values()]
+        return [
+            Window(self, tuple(drive[first : first + frames]))
+            for drive in ordered
+            for first in range(len(drive) - frames + 1)
+        ]
+
     def path(self, index: int) -> Path | None:
         """Return the file that holds a scan; None where scans are not in files."""
         return None
@@ -140,6 +190,27 @@ class ScanDataset(ABC):
         Raises:
             OutputError: a file of it exists already.
         """
+
+
+@dataclass(frozen=True)
+class Window:
+    """Scans of one recording in order of time.
+
+    Args:
+        dataset: data set that holds the scans.
+        indices: numbers of the scans there.
+    """
+
+    dataset: ScanDataset
+    indices: tuple[int, ...]
+
+    def scans(self) -> list[Scan]:
+        """Read the scans, each with its time, and its pose where that is known.
+
+        Raises:
+            ScanError: the file of a scan cannot be used.
+        """
+        return [replace(self.dataset.scan(at), **self.dataset.motion(at)._asdict()) for at in self.indices]
 
 
 def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:

@@ -32,19 +32,18 @@ class FewerColumns:
 
     def read(self, index: int) -> Pixels:
         """Return the pixels of one image."""
-        range_m, reflectance, label = self._images.read(index)
+        range_m, planes = self._images.read(index)
         nearest_m = np.minimum.reduceat(np.where(range_m > 0, range_m, np.inf), self._first, axis=1)
         returned = np.isfinite(nearest_m)
-        if reflectance is not None or label is not None:
+        kept = dict[str, np.ndarray]()
+        if planes:
             column = np.arange(range_m.shape[1])
             is_nearest = range_m == np.repeat(nearest_m, self._counts, axis=1)
-            # Stored ranges have steps, so that several may be the nearest: the first gives reflectance and label.
+            # Stored ranges have steps, so that several may be the nearest: the first gives its planes.
             found = np.minimum.reduceat(np.where(is_nearest, column, column[-1]), self._first, axis=1)
-            reflectance, label = (
-                None if pixels is None else np.where(returned, np.take_along_axis(pixels, found, axis=1), 0)
-                for pixels in (reflectance, label)
-            )
-        return Pixels(np.where(returned, nearest_m, 0).astype(np.float32), reflectance, label)
+            for name, pixels in planes.items():
+                kept[name] = np.where(returned, np.take_along_axis(pixels, found, axis=1), 0)
+        return Pixels(np.where(returned, nearest_m, 0).astype(np.float32), kept)
 
 
 def has_fewer_columns(sensor: SensorModel, other: SensorModel) -> bool:

@@ -321,11 +321,8 @@ class PreparedImages:
         shard, entry = self._entries[index]
         name = f"{self._folder.location}/{shard_name(shard)}"
         pixels = read_image(self._bytes(shard), entry, self._shape, self.spec.range_step_m, name, verify)
-        return Pixels(
-            pixels.range_m,
-            pixels.reflectance if self._has_reflectance else None,
-            pixels.label if self._has_labels else None,
-        )
+        kept = {"reflectance": self._has_reflectance, "label": self._has_labels}
+        return Pixels(pixels.range_m, {name: plane for name, plane in pixels.planes.items() if kept[name]})
 
     def shard_of(self, index: int) -> int:
         """Return the number of the shard that holds an image."""

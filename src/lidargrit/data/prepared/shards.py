@@ -230,8 +230,8 @@ def read_image(
         if hashes != (entry.fingerprint, entry.label_fingerprint):
             raise _damaged(name, ValueError("pixels that differ from their fingerprint"))
     range_m = np.multiply(steps, np.float32(step_m), dtype=np.float32)
-    reflectance = None if levels is None else np.multiply(levels, np.float32(1 / 255), dtype=np.float32)
-    return Pixels(range_m, reflectance, classes)
+    planes = {} if levels is None else {"reflectance": np.multiply(levels, np.float32(1 / 255), dtype=np.float32)}
+    return Pixels(range_m, planes if classes is None else {**planes, "label": classes})
 
 
 def _fingerprint(*parts: np.ndarray | None) -> str:

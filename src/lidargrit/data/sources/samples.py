@@ -116,7 +116,7 @@ class _Files:
             and ((reflectance >= 0) & (reflectance <= 1)).all()
         ):
             raise ScanError(f"a damaged reflectance in {path}", f"float32 {self._shape} in [0, 1]", cure)
-        return Pixels(range_m, reflectance)
+        return Pixels(range_m, {} if reflectance is None else {"reflectance": reflectance})
 
 
 def _model_and_sampling(manifest: dict[str, Any]) -> str:

@@ -20,6 +20,7 @@ from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
 from lidargrit.scans.condition import Observed
+from lidargrit.scans.planes import planes_of
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage
 
@@ -256,7 +257,7 @@ class PixelDecoder(nn.Module):
                 mask = self.mask.sample(some, uniform[part, 0], condition[part])
                 range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], choices)
             reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
-            images.append(RangeImage.masked(range_m, mask, self.sensor, reflectance))
+            images.append(RangeImage.masked(range_m, mask, self.sensor, planes_of(reflectance=reflectance)))
         return RangeImage.cat(images)
 
     def _sample_range(

@@ -91,7 +91,7 @@ def filled_scan(seen: InputScan, condition: Observed, images: RangeImage, hides:
     azimuth_rad = grid.sensor.azimuth_rad.double().mean(0).numpy()
     between_m = along_rows(measured_m, azimuth_rad, (grid.phases + 0.5) * 2 * np.pi / grid.sensor.width)
     range_m = torch.from_numpy(np.where(between_m > 0, between_m, range_m)).float()
-    image = RangeImage.masked(range_m, new, grid.sensor, completed.reflectance, completed.label)
+    image = RangeImage.masked(range_m, new, grid.sensor, completed.planes)
     filled = unproject(image)
     return CompletedScan(_with_rows(seen), kept, replace(filled, ring=_rings_of_added(seen, filled)))
 

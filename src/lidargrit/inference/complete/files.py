@@ -145,7 +145,8 @@ def write_completions(
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
-    return Written(len(files) - len(left_out) * output.count, *counts.tolist(), sensor_file)
+    points = dict(zip(("points_in", "points_out", "points_filled"), counts.tolist(), strict=True))
+    return Written(len(files) - len(left_out) * output.count, sensor_file=sensor_file, **points)
 
 
 def _write_cloud(
@@ -226,8 +227,8 @@ def _jobs(
 
 
 def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
-    """Group jobs that follow one another; a batch has reflectance, or labels, only if all of its scans have them."""
-    for _, alike in groupby(jobs, lambda job: (job.condition.reflectance is None, job.condition.label is None)):
+    """Group jobs that follow one another; scans of a batch have the same planes."""
+    for _, alike in groupby(jobs, lambda job: job.condition.planes.keys()):
         while batch := list(islice(alike, at_most)):
             yield batch
 

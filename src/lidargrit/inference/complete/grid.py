@@ -71,8 +71,8 @@ class RayGrid:
 
 
 def _of_other_size(images: RangeImage, sensor: SensorModel, change: Callable[[Tensor], Tensor]) -> RangeImage:
-    reflectance, label = (None if pixels is None else change(pixels) for pixels in (images.reflectance, images.label))
-    return RangeImage(change(images.range_m), change(images.return_mask), sensor, reflectance, label)
+    planes = {name: change(pixels) for name, pixels in images.planes.items()}
+    return RangeImage(change(images.range_m), change(images.return_mask), sensor, planes)
 
 
 def phase_seed(seed: int, phase: int) -> int:

@@ -51,15 +51,12 @@ class SparseReader(ScanReader):
         size = (wanted.height, wanted.width)
         range_m, on_grid = torch.zeros(size), torch.zeros(size, dtype=torch.bool)
         at = torch.full(size, -1, dtype=torch.int64)
-        reflectance = None if seen.image.reflectance is None else torch.zeros(size)
-        label = None if seen.image.label is None else torch.zeros(size, dtype=torch.int64)
         range_m[target], at[target], on_grid[target] = taken(seen.image.range_m), taken(seen.point_of_pixel, -1), fired
-        if reflectance is not None and seen.image.reflectance is not None:
-            reflectance[target] = taken(seen.image.reflectance)
-        if label is not None and seen.image.label is not None:
-            label[target] = taken(seen.image.label)
+        planes = {name: pixels.new_zeros(size) for name, pixels in seen.image.planes.items()}
+        for name, pixels in planes.items():
+            pixels[target] = taken(seen.image.planes[name])
         within = (range_m >= wanted.range_min_m) & (range_m <= wanted.range_max_m)
-        image = RangeImage.masked(range_m, within, wanted, reflectance, label)
+        image = RangeImage.masked(range_m, within, wanted, planes)
         return InputScan(image, scan, at, on_grid, seen.doubt, self._coordinates(scan, seen, rows))
 
     def _coordinates(self, scan: Scan, seen: InputScan, rows: Int64[Tensor, " rows"]) -> PixelCoordinates:

@@ -213,4 +213,4 @@ def complete_images(model: Model, condition: Observed, seeds: list[int]) -> Rang
     place[known] = torch.arange(len(some))
     found = done[place.tolist()]
     returned = found.return_mask & known[:, None, None]
-    return RangeImage.masked(found.range_m, returned, found.sensor, found.reflectance, found.label)
+    return RangeImage.masked(found.range_m, returned, found.sensor, found.planes)

@@ -37,7 +37,7 @@ def project(
             not mean a beam that did not return.
 
     Returns:
-        range_m (H, W) in metres and return_mask (H, W), with reflectance and label if the scan has them.
+        range_m (H, W) in metres and return_mask (H, W), with the planes reflectance and label if the scan has them.
 
     Raises:
         ConfigError: no method or variant of that name.
@@ -60,15 +60,14 @@ def project(
             "check that the file is in metres, or choose another sensor",
         )
     range_m = np.where(filled, range_m, np.float32(0))
-    reflectance = None
+    planes = dict[str, torch.Tensor]()
     if scan.reflectance is not None:
         of_point = np.append(scan.reflectance.numpy(), np.float32(0))  # that of no point, -1, is the last
-        reflectance = torch.from_numpy(of_point.take(point_of_pixel))
-    label = None
+        planes["reflectance"] = torch.from_numpy(of_point.take(point_of_pixel))
     if scan.label is not None:
         of_point = np.append(scan.label.long().numpy() & CLASS_BITS, 0)  # 8 bits do not hold that mask
-        label = torch.from_numpy(of_point.take(point_of_pixel))
-    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, reflectance, label)
+        planes["label"] = torch.from_numpy(of_point.take(point_of_pixel))
+    return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, planes)
 
 
 def told_share(image: RangeImage, num_points: int) -> str:

@@ -184,21 +184,18 @@ class CompletionNetwork(nn.Module):
         images, uniform = [], self.mask.uniform(rngs)
         for index in range(len(rngs)):
             one = condition[index : index + 1]
-            shown = replace(  # what the network has not learned needs no hints
-                one,
-                label=one.label if self.config.labels else None,
-                reflectance=one.reflectance if self.config.reflectance else None,
-            )
+            learned = {"label": self.config.labels, "reflectance": self.config.reflectance}  # others need no hints
+            shown = replace(one, planes={name: pixels for name, pixels in one.planes.items() if learned.get(name)})
             hints = hints_of(shown)
             point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
             v = (point.v + mirrored.v.flip(-1)) / 2
             mask = self.mask.sample(point.guide, uniform[index : index + 1], one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
-            label, reflectance = None, None
+            planes = dict[str, Tensor]()
             if hints.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:
-                label = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
+                planes["label"] = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
             if hints.reflectances is not None and point.reflectance is not None and mirrored.reflectance is not None:
-                reflectance = ((point.reflectance + mirrored.reflectance.flip(-1)) / 2).clamp(0, 1)
+                planes["reflectance"] = ((point.reflectance + mirrored.reflectance.flip(-1)) / 2).clamp(0, 1)
             range_m = v.expm1().clamp(low_m, high_m)
-            images.append(RangeImage.masked(range_m, mask, condition.sensor, reflectance, label))
+            images.append(RangeImage.masked(range_m, mask, condition.sensor, planes))
         return RangeImage.cat(images)

@@ -66,13 +66,13 @@ class CompletionObjective(Objective):
         images = example.images
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
         condition, learned = Observed.of_pixels(images, observed), self.completion.config
-        label, reflectance = None, None  # no hints are computed of what the network does not see
+        planes = dict[str, Tensor]()  # no hints are computed of what the network does not see
         if learned.labels:
-            label = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
+            planes["label"] = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
         if learned.reflectance:
             shown = required_reflectance(condition.reflectance, _SETTING)
-            reflectance = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
-        condition = replace(condition, label=label, reflectance=reflectance)
+            planes["reflectance"] = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
+        condition = replace(condition, planes=planes)
         point = self.completion(hints_of(condition), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()

@@ -240,7 +240,8 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         near_m, far_m = _WINDOWS_M[sampling.raydrop]
         sensor = self.sensor
         returned = (range_m > max(near_m, sensor.range_min_m)) & (range_m < min(far_m, sensor.range_max_m))
-        return RangeImage.masked(range_m, returned, sensor, values[:, 1] if self.config.reflectance else None)
+        planes = {"reflectance": values[:, 1]} if self.config.reflectance else {}
+        return RangeImage.masked(range_m, returned, sensor, planes)
 
 
 class ScoreMatching(Objective):

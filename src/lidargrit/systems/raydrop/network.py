@@ -15,6 +15,7 @@ from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Observed
+from lidargrit.scans.planes import planes_of
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
 
@@ -144,7 +145,8 @@ class RaydropNetwork(nn.Module):
             found = self(one.range_m, one.range_observed, one.label)
             returned = self.mask.sample(found.guide, uniform[index : index + 1], one)
             reflectance = None if found.reflectance is None else found.reflectance.clamp(0, 1)
-            images.append(RangeImage.masked(one.range_m, returned, condition.sensor, reflectance, one.label))
+            planes = planes_of(reflectance=reflectance, label=one.label)
+            images.append(RangeImage.masked(one.range_m, returned, condition.sensor, planes))
         return RangeImage.cat(images)
 
     def _maps(self, range_m: Float[Tensor, "B H W"], surface: Bool[Tensor, "B H W"]) -> Float[Tensor, "B 8 H W"]:

@@ -22,6 +22,7 @@ import torch
 
 from lidargrit.core.errors import ConfigError, LidarGritError, OutputError, one_of
 from lidargrit.data import formats
+from lidargrit.scans.planes import PLANES
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -154,9 +155,9 @@ class Application:
         sensor = SensorModel.from_json(self._queue.models[job.request.model]["rays"])
         with np.load(job.folder / PIXELS_FILE, allow_pickle=False) as pixels:
             range_m = torch.from_numpy(pixels[f"range_m_{scan_set}"][index])
-            kept = [pixels.get(f"{name}_{scan_set}") for name in ("reflectance", "label")]
-        reflectance, label = (None if one is None else torch.from_numpy(one[index]) for one in kept)
-        scan = unproject(RangeImage(range_m, range_m > 0, sensor, reflectance, label))
+            kept = [name for name in PLANES if f"{name}_{scan_set}" in pixels]
+            planes = {name: torch.from_numpy(pixels[f"{name}_{scan_set}"][index]) for name in kept}
+        scan = unproject(RangeImage(range_m, range_m > 0, sensor, planes))
         try:
             with tempfile.TemporaryDirectory(dir=job.folder) as folder:
                 path = Path(folder) / f"scan.{ending}"

@@ -221,10 +221,8 @@ def _answer_request(
         pixels: dict[str, Any] = {}
         for index, scans in enumerate(sets):
             pixels[f"range_m_{index}"] = scans.images.range_m.numpy()
-            if scans.images.reflectance is not None:
-                pixels[f"reflectance_{index}"] = scans.images.reflectance.numpy()
-            if scans.images.label is not None:
-                pixels[f"label_{index}"] = scans.images.label.numpy()
+            for name, plane in scans.images.planes.items():
+                pixels[f"{name}_{index}"] = plane.numpy()
         try:
             write_text(folder / PAGE_FILE, json.dumps(page_data(sets)))
             with atomic_path(folder / PIXELS_FILE) as temporary, temporary.open("wb") as file:

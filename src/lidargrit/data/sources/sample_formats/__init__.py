@@ -176,7 +176,8 @@ class _Tensors:
         range_m, reflectance = self._format.decode(scan)
         if not bool(((range_m >= 0) & (range_m < math.inf)).all()):
             raise ScanError(f"ranges that are negative or no number in {path}", "metres", "check what wrote it")
-        return Pixels(_array(range_m), None if reflectance is None else _array(reflectance.nan_to_num().clamp(0, 1)))
+        planes = {} if reflectance is None else {"reflectance": _array(reflectance.nan_to_num().clamp(0, 1))}
+        return Pixels(_array(range_m), planes)
 
     def _tensor(self, path: Path) -> Tensor:
         known, tensor = self._last  # one pair, replaced at once: safe from several threads

@@ -1,0 +1,82 @@
+"""The files of one KITTI sequence, ``times.txt``, ``poses.txt``, ``calib.txt`` → when and where each scan was made."""
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.files import read_text
+from lidargrit.data.datasets import Motion
+
+_POSE = "12 finite numbers in each row, the first three rows of a pose"
+
+
+@lru_cache(maxsize=64)
+def motions(sequence: Path) -> tuple[Motion, ...]:
+    """Return time and pose of every scan of a sequence, by the number of its file.
+
+    Poses of KITTI are those of its left camera; ``Tr`` of ``calib.txt`` leads from the sensor to that camera.
+
+    Args:
+        sequence: folder that holds the files; a time or pose without its files is unknown.
+
+    Raises:
+        DataError: a file that is no table of finite numbers, times that do not rise, or poses without ``Tr``.
+
+    Source:
+        Geiger et al., CVPR 2012, readme.txt of the odometry benchmark's development kit.
+    """
+    times_s = _table(sequence / "times.txt", 1, "one finite number of seconds in each row")[:, 0]
+    if bool((np.diff(times_s) <= 0).any()):
+        raise DataError(f"times that do not rise in {sequence / 'times.txt'}", "rising seconds", "restore the file")
+    cameras = _table(sequence / "poses.txt", 12, _POSE).reshape(-1, 3, 4)
+    poses = _homogeneous(cameras)
+    if len(poses):
+        camera_from_sensor = _camera_from_sensor(sequence / "calib.txt")
+        poses = np.linalg.inv(camera_from_sensor) @ poses @ camera_from_sensor
+    count = max(len(times_s), len(poses))
+    return tuple(
+        Motion(
+            float(times_s[number]) if number < len(times_s) else None,
+            torch.from_numpy(poses[number]) if number < len(poses) else None,
+        )
+        for number in range(count)
+    )
+
+
+def _camera_from_sensor(path: Path) -> Float64[np.ndarray, "4 4"]:
+    rows = [line.removeprefix("Tr:") for line in _lines(path) if line.startswith("Tr:")]
+    found = _numbers(rows, 12, path, f"a row 'Tr:' with {_POSE}")
+    if len(found) != 1 or abs(np.linalg.det(found.reshape(3, 4)[:, :3])) < 0.5:  # a rotation has 1
+        raise DataError(f"{path} without a pose 'Tr:'", "that of the sensor before the camera", "restore the file")
+    return _homogeneous(found.reshape(1, 3, 4))[0]
+
+
+def _homogeneous(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 4 4"]:
+    last = np.broadcast_to(np.array([0.0, 0, 0, 1]), (len(poses), 1, 4))
+    return np.concatenate((poses, last), 1)
+
+
+def _table(path: Path, columns: int, wanted: str) -> Float64[np.ndarray, "n columns"]:
+    return _numbers([line for line in _lines(path) if line.strip()], columns, path, wanted)
+
+
+def _numbers(rows: list[str], columns: int, path: Path, wanted: str) -> Float64[np.ndarray, "n columns"]:
+    try:
+        found = np.array([[float(word) for word in row.split()] for row in rows]).reshape(len(rows), columns)
+    except ValueError:
+        raise DataError(f"a row of {path} with something else", wanted, "restore the file") from None
+    if not np.isfinite(found).all():
+        raise DataError(f"a number of {path} that is not finite", wanted, "restore the file")
+    return found
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines of a file; none where there is no such file."""
+    try:
+        return read_text(path).splitlines() if path.exists() else []
+    except ConfigError as error:
+        raise DataError(error.got, error.wanted, error.cure) from None
