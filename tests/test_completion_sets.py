@@ -14,7 +14,7 @@ from lidargrit.core.reporting import Reporter
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
-from lidargrit.inference.complete.files import _suffix
+from lidargrit.inference.complete.clouds_to_files import suffix_of
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
 from lidargrit.inference.complete.sparse import SparseReader
 from lidargrit.scans.projection import unproject
@@ -181,10 +181,11 @@ def test_points_without_a_pixel_are_counted_once(tmp_path):
     assert [f"holds {kept[0]:,} of the {points:,} points" in line for line in counted] == [True]
 
 
-def test_a_format_of_another_sensor_is_not_taken():
-    assert _suffix(".pcd.bin", "", load_sensor("hdl64e_kitti_odometry")) == ".npz"
-    assert _suffix(".pcd.bin", "", load_sensor("hdl32e")) == ".pcd.bin"
-    assert _suffix(".ply", "", load_sensor("hdl64e_kitti_odometry")) == ".ply"
+def test_a_cloud_keeps_its_format_where_that_holds_all_of_its_points():
+    kept = {ending: suffix_of(ending, "") for ending in (".bin", ".pcd.bin", ".ply", ".feather", ".png", ".pcap", "")}
+    assert kept == {".bin": ".bin", ".pcd.bin": ".pcd.bin", ".ply": ".ply"} | dict.fromkeys(
+        (".feather", ".png", ".pcap", ""), ".npz"
+    )
 
 
 def test_a_file_system_that_makes_no_folder_is_told_of(tmp_path, monkeypatch):

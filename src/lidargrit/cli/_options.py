@@ -1,10 +1,7 @@
 """Options that several verbs share: one wording and one meaning for each."""
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-from lidargrit.core.untrusted import seed_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
@@ -74,22 +71,3 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--device``."""
     device = "device to compute on: cpu, cuda or cuda:1 (default: cuda if there is one)"
     parser.add_argument("--device", default="", help=device)
-
-
-def add_completion(parser: argparse.ArgumentParser, model: str, points_only: bool = False) -> None:
-    """Add the options of all verbs that complete scans: source, folder, ``model``, number and kind of files."""
-    images = ", samples, prepared scans, or range images as .npy"
-    scans = f"scans: a file, a folder, NAME:ROOT:SPLIT{' of points' if points_only else images}"
-    parser.add_argument("scans", help=scans)
-    parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
-    parser.add_argument("--model", default="pretrained", help=model)
-    each = "number of completions of each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
-    parser.add_argument("-n", "--count", type=int, default=1, help=each)
-    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first completion")
-    some = "number of scans to take, evenly spaced; 0 for all"
-    parser.add_argument("--max-scans", type=int, default=0, help=some)
-    kind = "format of the files: bin, pcd, ply, npz, a name from: lidargrit list formats, or image for range images as "
-    kind += ".npy (default: that of each scan's file)"
-    parser.add_argument("--format", default="", help=kind)
-    add_settings(parser, "sampling settings to change, such as temperature=0.9; see: lidargrit list generators")
-    add_device(parser)

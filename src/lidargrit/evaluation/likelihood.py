@@ -1,7 +1,7 @@
 """Likelihood of scans under a model: range images → bits with intervals, and maps of bits."""
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -9,16 +9,18 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
-from lidargrit.data.sources import RunSource, open_source, overlap
+from lidargrit.data.sources import DatasetSource, RunSource, open_source, overlap
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
+from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.types import ScanBits
 
 _BATCH = 4
@@ -193,7 +195,11 @@ def likelihood_of_source(
     variant = run.projection_variant(config) or config.projection_variant
     config = replace(config, projection_variant=variant)
     generator = load(run.folder).to(usable_device(device))
-    images = open_source(text, config.bad_points).images(run.sensor, config, reporter)
+    source = open_source(text, config.bad_points)
+    images = source.images(run.sensor, config, reporter)
+    if isinstance(source, DatasetSource):
+        with suppress(ScanError):  # of a first scan that was left out, and told of
+            reporter.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))
     if shared := overlap(run, None, images):
         reporter.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")
     return score_likelihood(generator, images, step_mm, reporter, maps)

@@ -75,6 +75,16 @@ def nearest(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
     return seen.nearest_range_m
 
 
+def along_rows(
+    range_m: Float64[np.ndarray, "H W"], azimuth_rad: Float64[np.ndarray, " W"], at_most_rad: float
+) -> Float64[np.ndarray, "H W"]:
+    """Interpolate 1 / range along rows between returns of one surface that are near enough to each other; else 0."""
+    width = range_m.shape[1]
+    thrice = np.tile(range_m, (1, 3)), _thrice(azimuth_rad)
+    found, span = (part[:, width : 2 * width] for part in _between(*thrice, across=False))
+    return np.where((span <= at_most_rad) & np.isfinite(found), found, 0)
+
+
 def linear(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
     """Interpolate 1 / range along the row or the column, whichever has the nearer pair of observed returns.
 
@@ -355,13 +365,14 @@ def _widest_gap(some: Bool[np.ndarray, " W"]) -> int:
 
 
 def _between(
-    range_m: Float64[np.ndarray, "lines n"], angle_rad: Float64[np.ndarray, " n"]
+    range_m: Float64[np.ndarray, "lines n"], angle_rad: Float64[np.ndarray, " n"], across: bool = True
 ) -> tuple[Float64[np.ndarray, "lines n"], Float64[np.ndarray, "lines n"]]:
     """Interpolate between the last and the next return along lines; return that and their angular distance.
 
     Args:
         range_m: ranges along each line, 0 where none was observed.
         angle_rad: angle of each pixel of a line, falling or rising.
+        across: whether the nearer of two returns on different surfaces counts, or neither.
     """
     index = np.arange(range_m.shape[1])
     before = np.maximum.accumulate(np.where(range_m > 0, index, -1), axis=1)
@@ -375,5 +386,5 @@ def _between(
         share = np.where(span > 0, to_first / span, 0.0)
         one_surface = np.abs(np.log1p(first_m) - np.log1p(second_m)) <= EDGE
         smooth = 1 / ((1 - share) / first_m + share / second_m)
-    found = np.where(one_surface, smooth, np.where(share <= 0.5, first_m, second_m))
+    found = np.where(one_surface, smooth, np.where(share <= 0.5, first_m, second_m) if across else np.inf)
     return np.where(both, found, np.inf), np.where(both, span, np.inf)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.planes import NO_PLANES, PLANES, checked_planes, common_planes, planes_of
 from lidargrit.scans.sensors import SensorModel
 
@@ -37,6 +38,8 @@ class Scan:
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
             largest value decided; 0 elsewhere.
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
+        filled: True for points that a model added to the measured ones; None where none did.
+        rows: rows of the file that the points were read from; None where the format keeps none.
         time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
         pose: matrix from the sensor's frame to that of the recording, kept in 64 bits; None if it is not known.
 
@@ -51,6 +54,8 @@ class Scan:
     source: str = "a scan"
     full_scale: int = 0
     notes: tuple[str, ...] = ()
+    filled: Bool[Tensor, "n"] | None = None
+    rows: FileRows | None = None
     time_s: float | None = None
     pose: Float64[Tensor, "4 4"] | None = None
 
@@ -60,7 +65,7 @@ class Scan:
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
-        for name in ("reflectance", "ring", "label"):
+        for name in ("reflectance", "ring", "label", "filled"):
             values: Tensor | None = getattr(self, name)
             if values is not None and values.shape != (len(self),):
                 raise ScanError(
@@ -99,6 +104,15 @@ class Scan:
 
     def __len__(self) -> int:
         return self.points_xyz_m.shape[0]
+
+    def measured(self) -> "Scan":
+        """Return the scan without the points that a model added."""
+        if self.filled is None or bool(self.filled.all()):
+            return self
+        kept = ~self.filled
+        parts = (self.reflectance, self.ring, self.label)
+        reflectance, ring, label = (None if each is None else each[kept] for each in parts)
+        return Scan(self.points_xyz_m[kept], reflectance, ring, label, self.source, self.full_scale, self.notes)
 
 
 @dataclass(frozen=True, eq=False)

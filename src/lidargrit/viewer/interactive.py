@@ -50,6 +50,8 @@ _RAMPS = {
     },
 }
 _NO_RETURN = {"dark": (72, 81, 90), "light": (214, 220, 225)}
+_MEASURED = {"dark": (96, 165, 205), "light": (48, 104, 148)}
+_FILLED = {"dark": (255, 150, 40), "light": (214, 96, 0)}
 _UNKNOWN = {"dark": (140, 150, 160), "light": (110, 120, 130)}
 
 
@@ -135,6 +137,8 @@ def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
                 "ramps": {mode: _ramp(*of) for mode, of in ramps.items()},
                 "noReturn": _NO_RETURN[theme],
                 "unknown": _UNKNOWN[theme],
+                "measured": _MEASURED[theme],
+                "filled": _FILLED[theme],
             }
             for theme, ramps in _RAMPS.items()
         },
@@ -159,6 +163,8 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
         if scan_set.surprise is not None:
             share = (scan_set.surprise[index] / SURPRISED_BITS).clamp(0, 1)
             scan["surprise"] = _packed((255 * share).round().numpy().astype(np.uint8))
+        if scan_set.filled is not None:
+            scan["filled"] = _packed(scan_set.filled[index].numpy().astype(np.uint8))
         if label is not None:
             scan["label"] = _packed(np.searchsorted(numbers, label[index].numpy()).astype(np.uint8))
         scans.append(scan)

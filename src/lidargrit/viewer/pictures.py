@@ -24,6 +24,7 @@ from lidargrit.viewer.scan_sets import SURPRISED_BITS
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
 _TICKS_AT_LEAST, _TICKS_AT_MOST = 3, 6  # of elevation: enough to read a row's by, and words that do not overlap
+_FILLED, _FILLED_NOTE = "#e8730c", "\norange = filled in by a model"
 _SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
 
 
@@ -34,6 +35,7 @@ def plot_comparison(
     title: str = "",
     labels: list[str] | None = None,
     surprise: dict[str, Float[Tensor, "B H W"]] | None = None,
+    filled: dict[str, Bool[Tensor, "B H W"]] | None = None,
 ) -> None:
     """Plot groups of range images below one another: range, return mask and bird's-eye view of every scan.
 
@@ -47,6 +49,8 @@ def plot_comparison(
         labels: names of the scans; "scan 1", ... if not given.
         surprise: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
             :meth:`lidargrit.scans.types.ScanBits.surprise`.
+        filled: True for pixels whose point a model filled in, by group; they have another colour in the return mask and
+            in the bird's-eye view.
 
     Raises:
         ConfigError: no group, no or too many images in one, a limit of range that is not positive, or fewer labels
@@ -63,6 +67,9 @@ def plot_comparison(
     if surprise is not None:
         bits = [surprise[name][index].detach().cpu().numpy() for index, name in rows]
         panels = [replace(panel, surprise=each) for panel, each in zip(panels, bits, strict=True)]
+    for at, (index, name) in enumerate(rows):
+        if filled and name in filled:
+            panels[at] = replace(panels[at], filled=filled[name][index].cpu().numpy())
     scales = _Scales.of(panels, max_range_m)
     height = _HEAD * bool(title) + _ROW * len(panels) + _FOOT
     figure = Figure(figsize=(_WIDTH, height), dpi=DOTS_PER_INCH)
@@ -71,7 +78,8 @@ def plot_comparison(
         figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17, parse_math=False)
     for row, panel in enumerate(panels):
         _plot_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
-    _plot_scales(figure, height, scales, "" if surprise is None else _SURPRISE_NOTE)
+    notes = (_SURPRISE_NOTE if surprise is not None else "") + (_FILLED_NOTE if filled else "")
+    _plot_scales(figure, height, scales, notes)
     write_png(figure, path)
 
 
@@ -83,6 +91,7 @@ class _Panel:
     points_xyz_m: Float[np.ndarray, "n 3"]
     elevation_deg: Float[np.ndarray, " H"]
     surprise: Float[np.ndarray, "H W"] | None = None
+    filled: Bool[np.ndarray, "H W"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +171,8 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     mask = axes(0.75, 0.45, 9.9, 1.05)
     shape = {"aspect": "auto", "interpolation": "nearest", "extent": extent}
     if panel.surprise is None:
-        mask.imshow(panel.return_mask, cmap=ListedColormap([NO_RETURN, "#26323c"]), vmin=0, vmax=1, **shape)
+        kinds = panel.return_mask.astype(int) if panel.filled is None else panel.return_mask * (1 + panel.filled)
+        mask.imshow(kinds, cmap=ListedColormap([NO_RETURN, "#26323c", _FILLED]), vmin=0, vmax=2, **shape)
     else:
         mask.imshow(panel.surprise, cmap="inferno", vmin=0, vmax=SURPRISED_BITS, **shape)
     mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)
@@ -177,6 +187,9 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     view.scatter(
         y[order], x[order], c=z[order], s=min(2.5, 30_000 / max(len(z), 1)), linewidths=0, norm=norm, cmap=colours
     )
+    if panel.filled is not None:
+        x, y, _ = panel.points_xyz_m[panel.filled[panel.return_mask]].T
+        view.scatter(y, x, c=_FILLED, s=min(2.5, 30_000 / max(len(z), 1)), linewidths=0)
     view.plot(0, 0, marker="+", color="black", markersize=7)
     half = scales.half_view_m
     view.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", facecolor="white")  # left is to the left

@@ -3,7 +3,8 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.core.determinism import evenly_spaced
@@ -14,9 +15,9 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.projection import project
+from lidargrit.scans.projection import ProjectionVariant, index_map, project
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage
+from lidargrit.scans.types import RangeImage, Scan
 
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BATCH = 8  # scans computed at once: what a laptop has memory for
@@ -33,12 +34,14 @@ class ScanSet:
         scan_names: name of each image.
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
             if no model was asked.
+        filled: True for pixels whose point a model filled in; None where no scan says so.
     """
 
     name: str
     images: RangeImage
     scan_names: tuple[str, ...]
     surprise: Float[Tensor, "B H W"] | None = None
+    filled: Bool[Tensor, "B H W"] | None = None
 
 
 def load_scan_sets(
@@ -154,10 +157,12 @@ def _of_scans(
     dataset, imaging = source.scans(), source.imaging(sensor, config)
     imaging.report(reporter)
     sensor, config = imaging.sensor, imaging.config
-    images, names = [], []
+    images, names, filled = [], [], []
     for index in evenly_spaced(count, len(dataset)):
         try:
-            images.append(project(dataset.scan(index), sensor, variant=config.projection_variant))
+            scan = dataset.scan(index)
+            images.append(project(scan, sensor, variant=config.projection_variant))
+            filled.append(_filled(scan, sensor, config.projection_variant))
         except ScanError as error:
             if config.bad_scans == "refuse":
                 raise
@@ -166,7 +171,17 @@ def _of_scans(
         names.append(dataset.name(index))
     if not images:
         raise DataError(f"no usable scan in {source.text}", "at least one", "see the messages above")
-    return ScanSet(source.text, RangeImage.stack(images), tuple(names))
+    marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
+    known = any(one is not None for one in filled)
+    return ScanSet(source.text, RangeImage.stack(images), tuple(names), filled=marks if known else None)
+
+
+def _filled(scan: Scan, sensor: SensorModel, variant: ProjectionVariant) -> Bool[Tensor, "H W"] | None:
+    """Return in which pixels the point is one that a model filled in; None of a scan that does not say."""
+    if scan.filled is None:
+        return None
+    point = torch.from_numpy(index_map(scan, sensor, variant=variant)[:, :: sensor.column_stride]).long()
+    return torch.cat((scan.filled, torch.zeros(1, dtype=torch.bool)))[point]  # that of no point, -1, is the last
 
 
 def _short(source: str) -> str:

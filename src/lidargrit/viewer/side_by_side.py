@@ -60,7 +60,8 @@ def view(
         write_page(sets, out)
     else:
         surprise = {scans.name: scans.surprise for scans in sets if scans.surprise is not None}
-        plot_comparison(groups, out, surprise=surprise or None)
+        filled = {scans.name: scans.filled for scans in sets if scans.filled is not None}
+        plot_comparison(groups, out, surprise=surprise or None, filled=filled)
 
 
 def _surprise(model: Generator, images: RangeImage) -> Float[Tensor, "B H W"]:

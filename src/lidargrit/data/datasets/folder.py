@@ -13,6 +13,7 @@ from lidargrit.data.formats import BadPoints
 from lidargrit.data.formats.numpy_array import holds_points
 
 _SHARED_ENDINGS = (".png", ".csv", ".npy")  # of pictures, poses and labels, too
+SENSOR_FILE = "sensor.json"  # beside scans: what lidargrit complete writes, and what fit-sensor may
 _TOPIC = re.compile(r"(/[^\[\]]+)(\[[^\]]*\])?")
 
 
@@ -20,8 +21,9 @@ class Folder(FileDataset):
     """A folder of scans, or one file; a sequence is the folder that holds them, "." for the root itself.
 
     Every file whose ending belongs to a format is a scan, hidden ones left out, and pictures, poses and labels beside
-    scans (.png, .csv and .npy that hold no points). The sensor is that of the first file's
-    format, if such files always have the same, and the HDL-64E of KITTI otherwise; choose yours with ``data.sensor``.
+    scans (.png, .csv and .npy that hold no points). The sensor is that of a file ``sensor.json`` in the root, else that
+    of the first file's format, if such files always have the same, and the HDL-64E of KITTI otherwise; choose yours
+    with ``data.sensor``.
     """
 
     title = "a folder of scan files"
@@ -41,6 +43,8 @@ class Folder(FileDataset):
         self.notes = _left_out(root, len({path for path, _ in self._scans}))
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
         self.sensor = sensors[0] if sensors else type(self).sensor
+        if (root / SENSOR_FILE).is_file():
+            self.sensor = str(root / SENSOR_FILE)
 
     def takes_files_in(self, folder: Path) -> bool:
         """Return whether a folder is the root or lies below it, at whatever depth."""

@@ -3,15 +3,18 @@
 import functools
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from io import BufferedReader
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import OutputError, ScanError, first_words
+from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.types import Scan
 
 _CURES = {  # by the ending, for files that hold scans but are not read
@@ -72,8 +75,13 @@ class ScanFormat(ABC):
 
     @classmethod
     def can_write(cls) -> bool:
-        """Return whether :meth:`write` writes."""
-        return "write" in cls.__dict__
+        """Return whether scans can be written in it."""
+        return bool({"write", "write_columns"} & cls.__dict__.keys())
+
+    @classmethod
+    def writes_columns(cls) -> bool:
+        """Return whether named columns of any points can be written in it."""
+        return "write_columns" in cls.__dict__
 
     @staticmethod
     @abstractmethod
@@ -103,11 +111,26 @@ class ScanFormat(ABC):
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
         """Write a scan to a new file."""
-        raise OutputError(
-            f"a scan to write as {cls.title}",
-            "a format that can be written",
-            "choose another format, such as bin or ply",
-        )
+        cls.write_columns(path, cls.columns_of(scan))
+
+    @classmethod
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return the columns of a scan's file, one value for each point, by the names that the format has for them.
+
+        Raises:
+            OutputError: a format that is not written, or a scan that it does not hold.
+        """
+        raise cls._not_written()
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write named columns of equal length to a new file; ``filled`` is 1 for points that a model added, else 0."""
+        raise cls._not_written()
+
+    @classmethod
+    def _not_written(cls) -> OutputError:
+        wanted, cure = "a format that can be written", "choose another format, such as bin or ply"
+        return OutputError(f"a scan to write as {cls.title}", wanted, cure)
 
 
 def load(name: str) -> type[ScanFormat]:
@@ -203,13 +226,17 @@ def scan_of(
     label: Int[Tensor, "n"] | None = None,
     full_scale: int = 0,
     notes: tuple[str, ...] = (),
+    filled: Bool[Tensor, "n"] | None = None,
+    rows: FileRows | None = None,
 ) -> Scan:
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
     if bad_points == "drop":
         kept = usable_points(points_xyz_m, reflectance)
         points_xyz_m = points_xyz_m[kept]
         reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
-    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale, notes)
+        filled = None if filled is None else filled[kept]
+        rows = None if rows is None else FileRows(rows.columns, rows.of_point[kept.numpy()])
+    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale, notes, filled, rows)
 
 
 def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 
@@ -81,10 +82,14 @@ class CsvTable(ScanFormat):
         return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points, names)
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan to a new file, coordinates with all their digits."""
-        columns = columns_of(scan)
-        form = ["%.9g" if of.dtype.kind == "f" else "%d" for of in columns.values()]
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        return columns_of(scan)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns to a new file, numbers with all their digits."""
+        form = [{"f4": "%.9g", "f8": "%.17g"}.get(of.dtype.str[1:], "%d") for of in columns.values()]
         table = np.column_stack([of.astype(np.float64) for of in columns.values()])
         with atomic_path(path) as temporary:
             np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="ascii")

@@ -1,17 +1,19 @@
 """KITTI .bin: float32 rows x, y, z, reflectance ⇄ :class:`Scan`."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from lidargrit.core.errors import ScanError
-from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import wide_row
+from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, wide_row, write_rows
+from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
 
-_ROW_BYTES = 16  # x, y, z, reflectance
+_COLUMNS = ("x", "y", "z", "intensity")
+_ROW_BYTES = 16
 _ROWS_TO_LOOK_AT = 4096  # enough to tell reflectance from a coordinate
 _FORMAT = "float32 rows x, y, z, reflectance, 16 bytes a point"
 
@@ -55,12 +57,28 @@ class KittiBin(ScanFormat):
                 + "download it again: the file was cut short or is of another format",
             )
         rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4))
-        return scan_of(rows[:, :3], rows[:, 3].contiguous(), None, str(path), bad_points)
+        return scan_of(
+            rows[:, :3],
+            rows[:, 3].contiguous(),
+            None,
+            str(path),
+            bad_points,
+            filled=read_marks(path, len(rows)),
+            rows=rows_of(_COLUMNS, rows),
+        )
+
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the marks of filled points."""
+        return (marks_file(path),)
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan to a new file, with reflectance 0 if it has none."""
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates and reflectance, 0 if the scan has none."""
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
-        rows = torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(rows.numpy().astype("<f4").tobytes())
+        return columns_by_name(_COLUMNS, torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1), scan.filled)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write rows to a new file, and the marks of filled points beside it."""
+        write_rows(path, _COLUMNS, columns)

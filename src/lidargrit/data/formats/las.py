@@ -2,6 +2,7 @@
 
 import struct
 import warnings
+from collections.abc import Mapping
 from datetime import date
 from io import BytesIO
 from pathlib import Path
@@ -81,8 +82,13 @@ class Las(ScanFormat):
         return scan_of_columns(columns, path, bad_points)
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan to a new file.
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        return columns_of(scan)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns to a new file.
 
         Raises:
             OutputError: laspy is not installed, or a coordinate beyond 214 km.
@@ -91,19 +97,19 @@ class Las(ScanFormat):
             import laspy  # noqa: PLC0415  an optional part
         except ImportError:
             raise OutputError(f"no laspy to write {path}", "it installed", _INSTALL) from None
-        columns = columns_of(scan)
-        farthest_m = float(scan.points_xyz_m.abs().max())
+        xyz_m = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
+        farthest_m = float(np.abs(xyz_m).max())
         if farthest_m >= _STEP_M * np.iinfo(np.int32).max:
             raise OutputError(f"a coordinate of {farthest_m:g} m", "at most 214 km", "choose .ply")
         header = laspy.LasHeader(version="1.4", point_format=0)
         header.scales, header.offsets = np.full(3, _STEP_M), np.zeros(3)
         header.generating_software, header.creation_date = _OURS, _WRITTEN_ON
-        extra = {name: columns[name] for name in ("ring", "label") if name in columns}
+        extra = {name: columns[name] for name in ("ring", "label", "filled") if name in columns}
         if "intensity" in columns:  # the intensity alone does not say what its full scale is
             extra["reflectance"] = columns["intensity"].astype(np.float32)
         header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()])
         cloud: Any = laspy.LasData(header)
-        cloud.xyz = scan.points_xyz_m.double().numpy()
+        cloud.xyz = xyz_m
         if "intensity" in columns:
             cloud.intensity = _steps(columns["intensity"])
         for name, values in extra.items():

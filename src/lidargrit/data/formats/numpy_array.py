@@ -1,7 +1,7 @@
 """NumPy's .npz of named arrays, or .npy of rows x, y, z, reflectance, ring ⇄ :class:`Scan`."""
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from io import BufferedReader, BytesIO
 from pathlib import Path
@@ -19,6 +19,7 @@ from lidargrit.data.formats.shared.columns import (
     known_name,
     scan_of_columns,
 )
+from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers or of named ones, or an .npz with an array points of n rows"
@@ -71,6 +72,8 @@ class NumpyArray(ScanFormat):
             except ValueError as error:
                 raise damaged(path, _FORMAT, error) from None
             columns, names = _row_columns(rows, path), list(rows.dtype.names or ())
+            if (marks := read_marks(path, len(next(iter(columns.values()), ())))) is not None:
+                columns["filled"] = marks.numpy().astype(np.uint8)
         else:
             with _archive(BytesIO(data), path) as archive:
                 columns, names = (
@@ -79,17 +82,28 @@ class NumpyArray(ScanFormat):
                 )
         return scan_of_columns(columns, path, bad_points, names, are_named=bool(names))
 
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the marks of filled points beside an ``.npy``; an ``.npz`` holds them itself."""
+        return (marks_file(path),) if path.suffix.lower() == ".npy" else ()
+
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan to a new file, an ``.npy`` if the path ends so, which has no place for labels."""
-        columns = columns_of(scan)
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        return columns_of(scan)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns to a new file, an ``.npy`` if the path ends so, which holds x, y, z, intensity and ring."""
+        columns = dict(columns)
         points = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             if path.suffix.lower() != ".npy":
                 np.savez(file, points=points, **columns)  # pyright: ignore[reportArgumentType]  it fears a column "allow_pickle"
                 return
             if "ring" in columns:
-                columns.setdefault("intensity", np.zeros(len(scan), dtype=np.float32))
+                columns.setdefault("intensity", np.zeros(len(points), dtype=np.float32))
+            write_marks(path, columns.get("filled"))
             np.save(file, np.column_stack([points, *(columns[name] for name in _ROWS[3:] if name in columns)]))
 
 

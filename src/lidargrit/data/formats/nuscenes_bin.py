@@ -1,5 +1,6 @@
 """nuScenes .pcd.bin: float32 rows x, y, z, intensity, laser of an HDL-32E ⇄ :class:`Scan` with a ring per point."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +8,13 @@ import torch
 from jaxtyping import Float32
 
 from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, write_rows
+from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
 
-_ROW_BYTES = 20  # x, y, z, intensity, laser
+_COLUMNS = ("x", "y", "z", "intensity", "ring")
+_ROW_BYTES = 20
 _LASERS = 32
 _NEAR_M = 1.0  # a beam that did not return is stored as a point where the car has been, nearer than this
 _ROWS_TO_LOOK_AT = 4096  # enough to tell laser numbers from coordinates
@@ -60,14 +63,28 @@ class NuscenesBin(ScanFormat):
         rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 5))
         if not _are_lasers(rows[:, 4].numpy()):
             raise ScanError(f"laser numbers other than 0 to 31 in {path}", _FORMAT, "check the layout of its rows")
+        marks = read_marks(path, len(rows))
         far = ~(rows[:, :3].norm(dim=1) < _NEAR_M)  # NaN stays, to be refused or dropped
         x_right, y_forward, z, intensity, laser = (column[far] for column in rows.unbind(1))
         points_xyz_m = torch.stack((y_forward, -x_right, z), dim=1)
-        return scan_of(points_xyz_m, intensity / 255, _LASERS - 1 - laser.long(), str(path), bad_points)
+        return scan_of(
+            points_xyz_m,
+            intensity / 255,
+            _LASERS - 1 - laser.long(),
+            str(path),
+            bad_points,
+            filled=None if marks is None else marks[far],
+            rows=rows_of(_COLUMNS, rows, far),
+        )
+
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the marks of filled points."""
+        return (marks_file(path),)
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan of 32 rings to a new file, with intensity 0 if it has no reflectance.
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return the columns of a scan of 32 rings in the axes of the file, intensity 0 if it has no reflectance.
 
         Raises:
             OutputError: points without rings, or rings that an HDL-32E does not have.
@@ -81,8 +98,12 @@ class NuscenesBin(ScanFormat):
         x, y, z = scan.points_xyz_m.unbind(1)
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
         rows = torch.stack((-y, x, z, (255 * reflectance).round(), (_LASERS - 1 - scan.ring).float()), dim=1)
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(rows.numpy().astype("<f4").tobytes())
+        return columns_by_name(_COLUMNS, rows, scan.filled)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write rows to a new file, and the marks of filled points beside it."""
+        write_rows(path, _COLUMNS, columns)
 
 
 def _are_lasers(numbers: Float32[np.ndarray, "n"]) -> bool:

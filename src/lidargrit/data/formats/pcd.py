@@ -1,5 +1,6 @@
 """PCD files of the Point Cloud Library, text, binary or compressed ⇄ :class:`Scan`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
@@ -64,11 +65,15 @@ class Pcd(ScanFormat):
         )
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan to a new binary file."""
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        return columns_of(scan)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns to a new binary file."""
         from pypcd4.pypcd4 import Encoding, PointCloud  # noqa: PLC0415  for quick starts of what reads other files
 
-        columns = columns_of(scan)
         cloud = PointCloud.from_points(
             list(columns.values()), list(columns), [values.dtype for values in columns.values()]
         )

@@ -1,5 +1,6 @@
 """PLY files, text or binary of either byte order ⇄ :class:`Scan`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,7 +44,7 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
-_TYPE_NAMES = {"<f4": "float", "<u2": "ushort", "<u4": "uint"}  # of what is written
+_TYPE_NAMES = {kind: name for name, kind in reversed(_TYPES.items())}  # of what is written: char before int8
 
 
 class Ply(ScanFormat):
@@ -85,14 +86,25 @@ class Ply(ScanFormat):
         return scan_of_columns(columns, path, bad_points)
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan to a new binary file."""
-        columns = {name: values.astype(values.dtype.newbyteorder("<")) for name, values in columns_of(scan).items()}
-        lines = [f"property {_TYPE_NAMES[values.dtype.str]} {name}" for name, values in columns.items()]
-        header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scan)}", *lines, "end_header", ""]
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        return columns_of(scan)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write columns to a new binary file; whole numbers of 64 bits, which PLY has not, as doubles."""
+        columns = {name: _little_endian(values) for name, values in columns.items()}
+        lines = [f"property {_TYPE_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
+        count = len(next(iter(columns.values())))
+        header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header", ""]
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
         with atomic_path(path) as temporary:
             temporary.write_bytes("\n".join(header).encode() + rows.tobytes())
+
+
+def _little_endian(values: np.ndarray) -> np.ndarray:
+    kind = values.dtype if values.dtype.str[1:] in _TYPE_NAMES else np.dtype("f8")
+    return values.astype(kind.newbyteorder("<"))
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,19 @@
 """float32 rows x, y, z without reflectance, also named .bin ⇄ :class:`Scan`."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import row_width
+from lidargrit.data.formats.shared.bare_rows import columns_by_name, row_width, rows_of, write_rows
+from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
 
-_ROW_BYTES = 12  # x, y, z
+_COLUMNS = ("x", "y", "z")
+_ROW_BYTES = 12
 _ROWS_TO_LOOK_AT = 4096  # enough to see after how many values a file resembles itself
 _FARTHEST_M = 1000.0  # no lidar of a car sees farther; bytes that are no coordinates mostly are huge as float32
 _FORMAT = "float32 rows x, y, z, 12 bytes a point"
@@ -53,11 +55,17 @@ class XyzBin(ScanFormat):
         farthest_m = float(rows.nan_to_num(0.0, 0.0, 0.0).abs().max())
         if farthest_m > _FARTHEST_M:
             raise ScanError(f"a coordinate of {farthest_m:g} m in {path}", _FORMAT, "check the layout of its rows")
-        return scan_of(rows, None, None, str(path), bad_points)
+        marks = read_marks(path, len(rows))
+        return scan_of(rows, None, None, str(path), bad_points, filled=marks, rows=rows_of(_COLUMNS, rows))
+
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the marks of filled points."""
+        return (marks_file(path),)
 
     @classmethod
-    def write(cls, path: Path, scan: Scan) -> None:
-        """Write the points of a scan to a new file.
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return the coordinates of a scan.
 
         Raises:
             OutputError: a coordinate beyond 1,000 m, which would not be read back.
@@ -66,5 +74,9 @@ class XyzBin(ScanFormat):
         if farthest_m > _FARTHEST_M:
             what = f"a coordinate of {farthest_m:g} m in {scan.source}, to write as {cls.title}"
             raise OutputError(what, f"at most {_FARTHEST_M:g} m", "choose another format, such as ply")
-        with atomic_path(path) as temporary:
-            temporary.write_bytes(scan.points_xyz_m.numpy().astype("<f4").tobytes())
+        return columns_by_name(_COLUMNS, scan.points_xyz_m, scan.filled)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write rows to a new file, and the marks of filled points beside it."""
+        write_rows(path, _COLUMNS, columns)

@@ -1,7 +1,7 @@
 """A user's scans → range images on the grid of a sensor, and the points that lie in their pixels."""
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,13 +19,13 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
-from lidargrit.scans.condition import Observed
+from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
+from lidargrit.scans.projection.image import told_share
+from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
-
-_KEPT_UNTOLD = 0.95  # of a scan's points; the rest are strays, or nearer than the sensor's limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +38,9 @@ class InputScan:
         point_of_pixel: index of the point that fills each pixel, -1 for none; None where it was an image.
         on_grid: True for pixels that the scan covers; None for all.
         doubt: sign that another sensor than the named one made the scan, for a person; "" if there is none.
+        pixels: row, column and range of every point; None where it was an image.
+        by_ring: whether rows are rings.
+        grid: rays of the image, as images of a model; None for the image alone.
     """
 
     image: RangeImage
@@ -45,31 +48,41 @@ class InputScan:
     point_of_pixel: Int64[Tensor, "H W"] | None = None
     on_grid: Bool[Tensor, "H W"] | None = None
     doubt: str = ""
+    pixels: PixelCoordinates | None = None
+    by_ring: bool = False
+    grid: RayGrid | None = None
 
-    def joined(self, completed: RangeImage, condition: Observed) -> Scan:
-        """Return the points of a completed scan: its own where ranges were observed, elsewhere points on the pixels'
-        rays.
+    @property
+    def rays(self) -> RayGrid:
+        """Rays of the image, as images of a model."""
+        return self.grid or RayGrid(self.image.sensor, self.image.sensor)
 
-        Reflectance and label are kept where the whole completed scan has them; observed points keep their instances.
-        Where a model gives reflectance to points whose ranges alone were observed, it takes the place of their own.
-        """
-        kept = condition.range_observed[0] & completed.return_mask
-        if self.points is None or self.point_of_pixel is None or not bool(kept.any()):
-            return unproject(completed)
-        own = self.points
-        at = self.point_of_pixel[kept]
-        added = completed.return_mask & ~kept
-        new = RangeImage.masked(completed.range_m, added, completed.sensor, completed.planes)
-        rows = torch.arange(completed.sensor.height)[:, None].expand_as(kept)
-        reflectance = None if own.reflectance is None else own.reflectance[at]
-        whole = Scan(
-            own.points_xyz_m[at],
-            reflectance if completed.reflectance is None else completed.reflectance[kept],
-            rows[kept],
-            None if own.label is None else own.label[at],
-            own.source,
-        )
-        return _together(whole, unproject(new)) if bool(added.any()) else whole
+    @classmethod
+    def of_image(cls, image: RangeImage) -> "InputScan":
+        """Return a range image as a scan of points, one on the ray of each return."""
+        row, column = (part.numpy() for part in image.return_mask.nonzero(as_tuple=True))
+        range_m = image.range_m[image.return_mask].numpy()
+        pixels = PixelCoordinates(row, column.astype(np.int32), range_m, image.sensor.height, image.sensor.width)
+        return cls(image, unproject(image), pixels=pixels, by_ring=True)
+
+    @property
+    def cloud(self) -> Scan:
+        """Points of the scan."""
+        assert self.points is not None
+        return self.points
+
+    @property
+    def coordinates(self) -> PixelCoordinates:
+        """Row, column and range of every point."""
+        assert self.pixels is not None
+        return self.pixels
+
+    def taken(self) -> Bool[Tensor, "H W"]:
+        """Return the pixels in which a point lies, also one beyond the limits of range."""
+        pixels, taken = self.coordinates, torch.zeros_like(self.image.return_mask)
+        inside = pixels.in_rows()
+        taken[pixels.row[inside].astype(np.int64), pixels.column[inside].astype(np.int64)] = True
+        return taken
 
 
 class Inputs:
@@ -113,29 +126,28 @@ class Inputs:
         path = self._scans.path(index)
         return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
-    def read(self, index: int) -> InputScan:
-        """Read one scan; tell once how many of its points have a pixel, and if another sensor seems to have made it.
+    def read(self, index: int, see: Callable[[Scan], InputScan] | None = None) -> InputScan:
+        """Read one scan; tell once if another sensor seems to have made it, and how many points have no pixel.
+
+        Args:
+            index: index of the scan.
+            see: function that brings a cloud to the rays that all of its points lie on; not given, it becomes one image
+                of the reader's sensor. A range image stays as it is.
 
         Raises:
             ScanError: a scan that cannot be used, or of another sensor.
         """
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
-        scan = self._reader.read(self._scans.scan(index))
-        if not self._counted and scan.points is not None:
-            self._tell_points(scan.image, len(scan.points))
+        points = self._scans.scan(index)
+        scan = self._reader.read(points) if see is None else see(points)
+        if not self._counted and see is None:
+            self._counted = True
+            self._reporter.message(told_share(scan.image, len(points)))
         if scan.doubt and not self._doubted:
             self._reporter.message(f"WARNING: {scan.doubt}")
             self._doubted = True
         return scan
-
-    def _tell_points(self, image: RangeImage, num_points: int) -> None:
-        kept, self._counted = int(image.return_mask.sum()), True
-        if kept < _KEPT_UNTOLD * num_points:
-            self._reporter.message(
-                f"the image of {image.sensor.height}x{image.sensor.width} holds {kept:,} of the {num_points:,} points "
-                "of the first scan, one a pixel; the others are left out (a sensor or model of more columns keeps more)"
-            )
 
 
 @dataclass(frozen=True)
@@ -145,11 +157,15 @@ class ScanReader:
     Args:
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
+        few_rings_cure: cure of a scan of far fewer rows.
     """
 
     sensor: SensorModel
     variant: ProjectionVariant = "exact"
     partial: bool = False
+    few_rings_cure: str = (
+        "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor"
+    )
 
     def read(self, scan: Scan) -> InputScan:
         """Project a scan; by elevation if its rings or its firing order do not fit, but not a file that was cut off."""
@@ -157,7 +173,7 @@ class ScanReader:
             raise ScanError(
                 f"{ring_count(scan)} rings in {scan.source}",
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
-                "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor",
+                self.few_rings_cure,
             )
         method = projection_that_fits(scan, self.sensor)
         try:
@@ -177,7 +193,10 @@ class ScanReader:
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         doubt = doubts_about_rays(scan, self.sensor, method)
         said = told_doubt(scan.source, self.sensor, doubt)
-        return InputScan(image, scan, torch.from_numpy(at.astype(np.int64)), doubt=said)
+        pixels = pixel_coordinates(scan, self.sensor, method, variant)
+        pixels = replace(pixels, column=pixels.column // self.sensor.column_stride, width=self.sensor.width)
+        at = torch.from_numpy(at.astype(np.int64))
+        return InputScan(image, scan, at, doubt=said, pixels=pixels, by_ring=method == "unfolding")
 
 
 def images_for(models: Sequence[Model], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
@@ -225,15 +244,3 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: R
 def sensor_of(source: str, name: str = "") -> SensorModel:
     """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
     return load_sensor(name) if name else open_source(source).sensor
-
-
-def _together(own: Scan, added: Scan) -> Scan:
-    assert own.ring is not None
-    assert added.ring is not None
-    reflectance, label = None, None
-    if own.reflectance is not None and added.reflectance is not None:
-        reflectance = torch.cat((own.reflectance, added.reflectance))
-    if own.label is not None and added.label is not None:
-        label = torch.cat((own.label, added.label))
-    points = torch.cat((own.points_xyz_m, added.points_xyz_m))
-    return Scan(points, reflectance, torch.cat((own.ring, added.ring)), label, own.source)

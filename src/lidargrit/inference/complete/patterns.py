@@ -12,6 +12,7 @@ from torch import Tensor
 from lidargrit.core.arrays import parse_array
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ScanError, UsageError
+from lidargrit.inference.complete.grid import phase_seed
 from lidargrit.scans.types import RangeImage
 
 FORMS = "rows:4, sector:45,315, pixels:0.1, returns or a mask.npy"
@@ -51,26 +52,30 @@ class Pattern:
         return {"observed": self.text, "observed_sha256": hashlib.sha256(content).hexdigest()}
 
     def mask(self, image: RangeImage, seed: int = 0, source: str = "a scan") -> Bool[Tensor, "H W"]:
-        """Return the mask of the observed pixels of one range image.
+        """Return the mask of the observed pixels of one range image; see :meth:`masks`."""
+        return self.masks(RangeImage.stack([image]), seed, source)[0]
+
+    def masks(self, images: RangeImage, seed: int = 0, source: str = "a scan") -> Bool[Tensor, "P H W"]:
+        """Return the masks of the observed pixels of the images that one scan consists of.
 
         Args:
-            image: range image (H, W).
-            seed: seed of the pixels that ``pixels:SHARE`` chooses.
+            images: batch of range images of one scan.
+            seed: seed of the pixels that ``pixels:SHARE`` chooses; each further image has others.
 
         Raises:
             UsageError: a mask of another size, or one by which all pixels are observed.
             ScanError: no return of this scan is observed, or ``returns`` of a scan in which every pixel has one.
         """
-        mask = self._mask(image, seed)
-        if self.text == "returns" and bool(mask.all()):
+        masks = torch.stack([self._mask(images[at], phase_seed(seed, at)) for at in range(len(images))])
+        if self.text == "returns" and bool(masks.all()):
             raise ScanError(f"{source}, in which every pixel has a return", "some without", "leave the scan out")
-        if bool(mask.all()):
+        if bool(masks.all()):
             got = f"--observed {self.text}, by which all pixels are observed"
             raise UsageError(got, "some pixels that are not", "choose other pixels")
-        if not bool((mask & image.return_mask).any()):
+        if not bool((masks & images.return_mask).any()):
             got = f"{source}, of which --observed {self.text} observes no return"
             raise ScanError(got, "some returns that are observed", "choose other pixels, or leave the scan out")
-        return mask
+        return masks
 
     def _mask(self, image: RangeImage, seed: int) -> Bool[Tensor, "H W"]:
         height, width = image.range_m.shape

@@ -1,7 +1,7 @@
 """Scans of a sensor with few rows → observed rows on the grid of a sensor with more rows."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.inference.complete.inputs import InputScan, ScanReader
+from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import RangeImage, Scan
 
@@ -35,8 +36,8 @@ class SparseReader(ScanReader):
     def read(self, scan: Scan) -> InputScan:
         """Project a scan by its own sensor, and put each of its rows into the wanted row of the nearest elevation.
 
-        A sensor that fires in fewer columns keeps its own: each gives its pixels to the wanted column of the nearest
-        azimuth. A wanted column that is the nearest to none stays unknown, since no ray went there.
+        A sensor that fires in fewer columns keeps its own: each gives its pixels to the wanted column that it lies in.
+        A wanted column in which none lies stays unknown, since no ray went there.
         """
         wanted = self.sensor
         seen = ScanReader(self._imaged, self.variant, self.partial).read(scan)
@@ -55,26 +56,43 @@ class SparseReader(ScanReader):
         for name, pixels in planes.items():
             pixels[target] = taken(seen.image.planes[name])
         within = (range_m >= wanted.range_min_m) & (range_m <= wanted.range_max_m)
-        return InputScan(RangeImage.masked(range_m, within, wanted, planes), scan, at, on_grid, seen.doubt)
+        image = RangeImage.masked(range_m, within, wanted, planes)
+        return InputScan(image, scan, at, on_grid, seen.doubt, self._coordinates(scan, seen, rows))
+
+    def _coordinates(self, scan: Scan, seen: InputScan, rows: Int64[Tensor, " rows"]) -> PixelCoordinates:
+        """Return the pixel of every point: in the row of its laser, or by elevation where that has none."""
+        wanted, own = self.sensor, seen.coordinates
+        by_elevation = pixel_coordinates(scan, wanted, "spherical", "exact")
+        of_laser = rows.numpy()[own.row.clip(0, own.height - 1)]
+        row = np.where(own.in_rows() & (of_laser >= 0), of_laser, by_elevation.row)
+        return replace(by_elevation, row=row, column=by_elevation.column // wanted.column_stride, width=wanted.width)
 
     @property
     def _imaged(self) -> SensorModel:
         """The scans' sensor with the columns of the wanted one, or with its own if it fires in fewer."""
         assert self.source is not None
-        own, stride = self.source.fine(), self.sensor.column_stride
-        columns = self.sensor.width * stride
-        return own if own.width < columns else own.with_columns(columns, stride)
+        own, wanted = self.source.fine(), self.sensor
+        if own.width < wanted.width * wanted.column_stride:
+            return own
+        columns = {"azimuth_rad": wanted.azimuth_rad.double().mean(0, keepdim=True).float()}
+        columns |= {"column_stride": wanted.column_stride, "first_edge_rad": wanted.first_edge_rad}
+        return replace(own, **columns)
 
     def _columns(self) -> Int64[Tensor, " W"]:
-        """Return for each wanted column that of the scans' image; -1 where this one is nearer to another wanted column.
+        """Return for each wanted column that of the scans' image whose azimuth lies in it, -1 where none does.
 
-        A pixel that lies between two rays of the same sensor was not seen, which is not the same as a lost return.
+        Of several the one nearest to its middle counts. A pixel that lies between two rays of the same sensor was not
+        seen, which is not the same as a lost return.
         """
         own, wanted = (mean_azimuths_rad(sensor.azimuth_rad) for sensor in (self._imaged, self.sensor))
-        apart = (wanted[:, None] - own).abs().remainder(2 * math.pi)
-        apart = torch.minimum(apart, 2 * math.pi - apart)
-        nearest = apart.argmin(1)
-        return torch.where(apart.argmin(0)[nearest] == torch.arange(len(wanted)), nearest, -1)
+        width = len(wanted)
+        # A column begins half a column before its middle, and its end is that of the next: so no azimuth is in two.
+        at = ((wanted[0] - own) * (width / (2 * math.pi)) + 0.5).remainder(width)
+        column = at.floor().long().clamp(max=width - 1)
+        nearest_last = torch.argsort((at - column - 0.5).abs(), descending=True, stable=True).numpy()
+        found = np.full(width, -1)
+        found[column.numpy()[nearest_last]] = nearest_last  # of several writes to a column the last one stays
+        return torch.from_numpy(found)
 
     def _rows(self) -> Int64[Tensor, " rows"]:
         """Return for each row of the scans' sensor the wanted row; -1 where none lies within three quarters of

@@ -70,6 +70,14 @@ def project(
     return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, planes)
 
 
+def told_share(image: RangeImage, num_points: int) -> str:
+    """Return what a person reads of how many points of a set's first scan its image holds."""
+    kept, size = int(image.return_mask.sum()), f"{image.sensor.height}x{image.sensor.width}"
+    what = f"the image of {size} holds {kept:,} of the {num_points:,} points of the first scan"
+    share = f"{kept / max(num_points, 1):.0%}, one a pixel"
+    return f"{what} ({share}); the others are left out (a sensor or model of more columns keeps more)"
+
+
 def index_map(
     scan: Scan,
     sensor: SensorModel,

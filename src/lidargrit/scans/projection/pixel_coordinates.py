@@ -92,8 +92,12 @@ def pixel_coordinates(
         row = spherical.rows(xyz_m, range_m, row_elevation_rad(sensor))
     elif scan.ring is not None:
         row = scan.ring.numpy()
-    else:
+    elif scan.filled is None:
         row = unfolding.rings_from_firing_order(xyz_m)
+    else:  # points that a model added lie on the rays of rows, and behind the measured ones
+        row = spherical.rows(xyz_m, range_m, row_elevation_rad(sensor)).astype(np.int32)
+        measured = ~scan.filled.numpy()
+        row[measured] = unfolding.rings_from_firing_order(np.ascontiguousarray(xyz_m[:, measured]))
     return PixelCoordinates(row, unfolding.columns(xyz_m, width, sensor.first_edge_rad), range_m, height, width)
 
 

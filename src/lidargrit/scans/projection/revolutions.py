@@ -14,6 +14,7 @@ _MORE_THAN_ONE = 1.02  # a revolution's end and beginning overlap by a few colum
 
 def revolutions(scan: Scan) -> float | None:
     """Return the number of revolutions, the median over the rings; None where rings or their order are not known."""
+    scan = scan.measured()  # points that a model added follow in an order of their own
     if scan.ring is None:
         return None
     x, y = scan.points_xyz_m[:, :2].double().numpy().T

@@ -82,6 +82,7 @@ def projection_that_fits(scan: Scan, sensor: SensorModel) -> ProjectionName:
     generated, simulated and shuffled clouds. A file whose rings are in order but too many or too few keeps the sensor's
     projection, which refuses it: it was cut, or is of another sensor.
     """
+    scan = scan.measured()  # others were added in another order
     if sensor.projection == "spherical" or scan.ring is not None or len(scan) < _POINTS_FOR_ORDER:
         return sensor.projection
     ring = _rings_in_order(scan)
@@ -96,6 +97,7 @@ def has_few_rings(scan: Scan, sensor: SensorModel) -> bool:
 
     The upper rings alone, of points in firing order, are a file that was cut off.
     """
+    scan = scan.measured()
     if not 1 < ring_count(scan) <= sensor.height // 2:
         return False
     if scan.ring is not None:
@@ -110,6 +112,8 @@ def doubts_about_rays(scan: Scan, sensor: SensorModel, method: ProjectionName) -
 
     The image of such a scan is not wrong, point by point, but its rows are not those of the lasers.
     """
+    if scan.filled is not None:  # a model's rays lie between those of the sensor
+        return ""
     pixels = pixel_coordinates(scan, sensor, method, "exact")
     kept = np.flatnonzero(pixels.in_rows() & within_limits(pixels.range_m, sensor))
     if len(kept) < _POINTS_FOR_ORDER:
@@ -194,7 +198,8 @@ def closest_sensor(scan: Scan) -> str:
 
 def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[str, float] | None:
     """Return how far rings lie from the rows of each sensor with as many, in the mean; None where rings are unknown."""
-    ring = _rings_in_order(scan) if scan.ring is None else scan.ring.numpy()
+    scan = scan.measured()
+    ring = known_rings(scan)
     if ring is None or int(ring.min()) < 0:
         return None
     points = np.bincount(ring)
@@ -209,6 +214,7 @@ def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[
 
 def ring_count(scan: Scan) -> int:
     """Count the rings of a scan by its highest ring index, or by its firing order if it names no rings."""
+    scan = scan.measured()
     if scan.ring is not None:
         return int(scan.ring.max()) + 1
     return int(unfolding.rings_from_firing_order(scan.points_xyz_m.numpy().T)[-1]) + 1
@@ -297,6 +303,11 @@ def _is_misplaced(scan: Scan, sensor: SensorModel, row: Int[np.ndarray, "n"]) ->
     off_deg[(some < 0) | (some >= sensor.height)] = np.inf
     bottom_deg, top_deg = _span_of_rows_deg(sensor)
     return bool(np.median(off_deg) > _MISPLACED_AT_MOST * (top_deg - bottom_deg))
+
+
+def known_rings(scan: Scan) -> Int[np.ndarray, "n"] | None:
+    """Return the ring of each point, as the file or its firing order tells; None where neither does."""
+    return _rings_in_order(scan) if scan.ring is None else scan.ring.numpy()
 
 
 def _rings_in_order(scan: Scan) -> Int[np.ndarray, "n"] | None:

@@ -45,12 +45,13 @@ class Page {
   // Only what some scan has.
   offerModes() {
     const has = (name) => this.panes.some((pane) => pane.source.data.scans.some((scan) => scan[name]));
-    for (const name of ["reflectance", "surprise", "label"]) {
+    for (const name of ["reflectance", "surprise", "label", "filled"]) {
       this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
     }
-    if (has("surprise") && !this.offeredSurprise) {
-      this.offeredSurprise = true;
-      this.control.mode.value = "surprise";
+    this.offered ??= ["surprise", "filled"].find(has);
+    if (this.offered && !this.chosen) {
+      this.chosen = true;
+      this.control.mode.value = this.offered;
     }
     this.control.position.max = String(this.count);
     for (const name of ["previous", "next", "position"]) {
@@ -184,6 +185,10 @@ function legendOf(look) {
     }
     const chips = [...names].map(([colour, together]) => chip(colour, together.join(", ")));
     return [...chips, chip(css(look.noReturn), "no return")];
+  }
+  if (look.mode === "filled") {
+    const chips = [[look.measured, "measured"], [look.filled, "filled by a model"], [look.noReturn, "no return"]];
+    return chips.map(([colour, words]) => chip(css(colour), words));
   }
   const ramp = document.createElement("span");
   ramp.className = "ramp";

@@ -166,6 +166,9 @@ class Pane {
     } else {
       facts.push(`${rangeM(source, scan, pixel).toFixed(2)} m away`, `height ${this.points[4 * pixel + 2].toFixed(2)} m`);
     }
+    if (scan.filled?.[pixel]) {
+      facts.push("filled by a model");
+    }
     if (scan.reflectance && scan.steps[pixel]) {
       facts.push(`reflectance ${(scan.reflectance[pixel] / 255).toFixed(2)}`);
     }

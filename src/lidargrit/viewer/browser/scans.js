@@ -49,6 +49,7 @@ async function unpackScan(source, data) {
     reflectance: data.reflectance && new Uint8Array(await unpack(data.reflectance)),
     surprise: data.surprise && new Uint8Array(await unpack(data.surprise)),
     label: data.label && new Uint8Array(await unpack(data.label)),
+    filled: data.filled && new Uint8Array(await unpack(data.filled)),
   };
 }
 
@@ -107,7 +108,7 @@ const POSITIONS = {
 function coloursOf(source, scan, points, look) {
   const colours = new Uint8ClampedArray(4 * source.size).fill(255);
   const ramp = look.ramps[look.mode];
-  const position = look.mode === "label" ? null : POSITIONS[look.mode](source, scan, points, look.scales[look.mode]);
+  const position = ["label", "filled"].includes(look.mode) ? null : POSITIONS[look.mode](source, scan, points, look.scales[look.mode]);
   const classOf = look.mode === "label" && scan.label && ((pixel) => source.classes[scan.label[pixel]].colour);
   for (let pixel = 0; pixel < source.size; pixel++) {
     let colour = look.unknown;
@@ -116,6 +117,8 @@ function coloursOf(source, scan, points, look) {
     } else if (position) {
       const step = Math.round(Math.min(1, Math.max(0, position(pixel))) * (ramp.length - 1));
       colour = ramp[step];
+    } else if (look.mode === "filled") {
+      colour = scan.filled?.[pixel] ? look.filled : look.measured;
     } else if (classOf) {
       colour = classOf(pixel);
     }

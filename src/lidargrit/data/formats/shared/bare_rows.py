@@ -1,7 +1,16 @@
-"""Bare float32 numbers of a file without a header → how many of them make a point."""
+"""Bare float32 numbers of a file without a header ⇄ named columns, and how many of them make a point."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+import torch
+from jaxtyping import Bool, Float32, Shaped
+from torch import Tensor
+
+from lidargrit.core.files import atomic_path
+from lidargrit.data.formats.shared.filled import write_marks
+from lidargrit.scans.file_rows import FileRows
 
 _WIDTHS = range(3, 9)  # x, y, z to x, y, z, intensity, ring, time and two more
 _FEW_NUMBERS, _WIDTHS_OF_FEW = 1024, range(3, 6)  # fewer do not show wider rows
@@ -28,6 +37,28 @@ def wide_row(values: Float32[np.ndarray, "n"]) -> int:
     """Return how many numbers make a point if they are more than four; 0 if not, or if too few tell."""
     width = row_width(values) if len(values) >= _FEW_NUMBERS else 0
     return width if width > 4 else 0
+
+
+def columns_by_name(
+    names: Sequence[str], rows: Float32[Tensor, "n w"], filled: Bool[Tensor, "n"] | None = None
+) -> dict[str, np.ndarray]:
+    """Return the numbers of every row by their names, with marks of filled points where there are some."""
+    marks = {} if filled is None else {"filled": filled.numpy()}
+    return {**dict(zip(names, rows.numpy().T, strict=True)), **marks}
+
+
+def rows_of(names: Sequence[str], rows: Float32[Tensor, "N w"], kept: Bool[Tensor, "N"] | None = None) -> FileRows:
+    """Return the rows of a file, of which those that are kept are the points of a scan; all if not given."""
+    every = torch.arange(len(rows))
+    return FileRows(columns_by_name(names, rows), (every if kept is None else every[kept]).numpy())
+
+
+def write_rows(path: Path, names: Sequence[str], columns: Mapping[str, Shaped[np.ndarray, "n"]]) -> None:
+    """Write columns as rows of little-endian numbers, and the marks of filled points beside them."""
+    rows = np.stack([columns[name] for name in names], axis=1).astype("<f4")
+    write_marks(path, columns.get("filled"))
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(rows.tobytes())
 
 
 def _mean_difference(values: Float32[np.ndarray, "n"], step: int) -> float:

@@ -16,6 +16,7 @@ from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.data.formats import BadPoints, damaged, scan_of
 from lidargrit.data.formats.shared.labels import notes_on_labels
 from lidargrit.data.formats.shared.reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
+from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.types import Scan
 
 BYTES_AT_MOST = 256_000_000  # 4 million points of 64 bytes; sensors' own files have up to 48 a point
@@ -23,6 +24,8 @@ REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that h
 
 _RING = ("ring", "channel")  # lower case; CloudCompare puts "scalar_" before its names
 _LABEL = ("label",)
+_FILLED = ("filled",)
+_TIME = ("time", "time_s", "timestamp", "time_stamp", "timestamps", "offset_time", "time_offset", "t")  # kept in files
 _ALIKE = re.compile("intens|reflect|remission|scalar.?field|laser|ring|channel|beam|layer")  # of names, not values
 _NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
 _LASERS = (16, 32, 40, 64, 80, 128, 256)  # that sensors have; the top ring may have no return, and not be in the file
@@ -74,16 +77,28 @@ def scan_of_columns(
     notes += _left_alone({*named, *map(_plain, others)})
     label = None if label is None else _whole(label, good, _LABEL_AT_MOST, "label", path)
     notes += notes_on_labels(label)
-    return scan_of(points_xyz_m, reflectance, ring, str(path), bad_points, label, full_scale, notes)
+    marks = _first(named, _FILLED)
+    filled = torch.from_numpy(marks == 1) if marks is not None and np.isin(marks, (0, 1)).all() else None
+    rows = FileRows(columns, np.arange(len(points_xyz_m)))
+    return scan_of(
+        points_xyz_m, reflectance, ring, str(path), bad_points, label, full_scale, notes, filled=filled, rows=rows
+    )
 
 
 def known_name(name: str) -> str:
     """Return the plain name of a column besides x, y and z that a scan has room for; "" if it has none."""
-    return _plain(name) if _plain(name) in (*REFLECTANCE_NAMES, *_RING, *_LABEL) else ""
+    return _plain(name) if _plain(name) in (*REFLECTANCE_NAMES, *_RING, *_LABEL, *_FILLED, *_TIME) else ""
+
+
+def quantity_of(name: str) -> str:
+    """Return what a column holds of a scan: x, y, z, reflectance, ring, label or filled; "" for something else."""
+    plain = _plain(name)
+    kinds = {"reflectance": REFLECTANCE_NAMES, "ring": _RING, "label": _LABEL, "filled": _FILLED}
+    return plain if plain in ("x", "y", "z") else next((kind for kind, names in kinds.items() if plain in names), "")
 
 
 def columns_of(scan: Scan) -> dict[str, np.ndarray]:
-    """Return a scan's columns for a file: x, y, z and what it has of intensity, ring and label."""
+    """Return a scan's columns for a file: x, y, z and what it has of intensity, ring, label and filled."""
     columns = {axis: scan.points_xyz_m[:, column].numpy() for column, axis in enumerate("xyz")}
     if scan.reflectance is not None:
         columns["intensity"] = scan.reflectance.numpy()
@@ -95,6 +110,8 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
                 f"{name}s from {int(values.min())} to {int(values.max())}", f"0 to {np.iinfo(kind).max}", "correct them"
             )
         columns[name] = values.numpy().astype(kind)
+    if scan.filled is not None:
+        columns["filled"] = scan.filled.numpy().astype(np.uint8)
     return columns
 
 

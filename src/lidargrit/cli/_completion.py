@@ -1,0 +1,93 @@
+"""What the verbs complete, upsample and raydrop have in common: their options, and what they say in the end."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lidargrit.cli._options import add_bad_scans, add_device, add_settings
+from lidargrit.core.errors import counted_scans
+from lidargrit.core.untrusted import seed_number
+
+if TYPE_CHECKING:
+    from lidargrit.inference.complete import Model
+    from lidargrit.inference.complete.command import Written
+    from lidargrit.inference.complete.tasks import Task
+    from lidargrit.scans.sensors import SensorModel
+
+
+def add_completion(parser: argparse.ArgumentParser, model: str, points_only: bool = False) -> None:
+    """Add the options of all three verbs: source, folder, ``model``, number and kind of files."""
+    parser.set_defaults(goes_on=True)
+    images = ", samples, prepared scans, or range images as .npy"
+    scans = f"scans: a file, a folder, NAME:ROOT:SPLIT{' of points' if points_only else images}"
+    parser.add_argument("scans", help=scans)
+    parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
+    parser.add_argument("--model", default="pretrained", help=model)
+    each = "number of completions of each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
+    parser.add_argument("-n", "--count", type=int, default=1, help=each)
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first completion")
+    some = "number of scans to take, evenly spaced; 0 for all"
+    parser.add_argument("--max-scans", type=int, default=0, help=some)
+    kind = (
+        "format of the clouds: bin, pcd, ply, npz, a name from: lidargrit list formats (default: that of each scan's "
+    )
+    kind += "file); or image for the model's range images alone, as .npy"
+    parser.add_argument("--format", default="", help=kind)
+    add_settings(parser, "sampling settings to change, such as temperature=0.9; see: lidargrit list generators")
+    add_device(parser)
+    add_bad_scans(parser)
+
+
+def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorModel | None") -> "Model":
+    """Return the model that the options name.
+
+    Args:
+        options: parsed options of one of the three verbs.
+        task: the work on each scan.
+        sensor: sensor that is named for a classical method, which gives whole clouds all of its columns; a run has its
+            own.
+    """
+    from lidargrit.inference.complete import is_classical, open_model
+
+    if sensor is not None and is_classical(options.model) and options.format != "image":
+        sensor = sensor.fine()
+    return open_model(options.model, task.kind, sensor, options.set, options.device)
+
+
+def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:
+    """Do a task with every scan, and say how many points came in and went out, and how to look at them."""
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.inference.complete.command import complete_scans
+    from lidargrit.inference.complete.files import OutputConfig
+
+    output = OutputConfig(options.count, options.seed, options.format, probability)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    found = complete_scans(options.scans, options.out, model, task, output, config, TerminalReporter())
+    kind = {"complete": "completed", "upsample": "upsampled", "raydrop": "dropped"}[task.verb]
+    print(f"done: {counted_scans(found.scans, kind)} in {options.out}{_points(found, task)}")
+    print(f"look at {'it' if found.scans == 1 else 'them'}: {_view(options, found, model)}")
+
+
+def _points(found: "Written", task: "Task") -> str:
+    if not found.points_in:
+        return "; completed.json says how they were made"
+    made = f"{found.points_out:,} points of {found.points_in:,}"
+    if not task.adds:
+        return f": {made}, {found.points_in - found.points_out:,} dropped"
+    kept = found.points_out - found.points_filled
+    left = f", {found.points_in - kept:,} that --observed hides left out" if kept < found.points_in else ""
+    return f": {found.points_out:,} points, {kept:,} measured and {found.points_filled:,} filled{left}"
+
+
+def _view(options: argparse.Namespace, found: "Written", model: "Model") -> str:
+    out = f"'{options.out}'" if " " in str(options.out) else str(options.out)
+    if found.sensor_file is None:
+        return f"lidargrit view {out} --sensor {model.sensor.name} --set data.columns={_columns(model)}"
+    return f"lidargrit view {out} -o {options.out.name}.html"
+
+
+def _columns(model: "Model") -> str:
+    sensor = model.sensor
+    stride = f" data.column_stride={sensor.column_stride}" if sensor.column_stride > 1 else ""
+    return f"{sensor.width * sensor.column_stride}{stride}"

@@ -1,0 +1,175 @@
+"""Files of completed clouds: what is kept of each, what is read back and seen, and input that is none."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from clouds_of_streets import DENSE, SIXTEEN, street
+from lidargrit.cli import main
+from lidargrit.data import formats
+from lidargrit.data.formats import read_scan
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.formats.pcd import Pcd
+from lidargrit.data.prepared.config import ScanSettings
+from lidargrit.inference.complete import open_model
+from lidargrit.inference.complete.tasks import complete_scan
+from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
+from lidargrit.viewer.scan_sets import load_scan_sets
+
+
+def columns_of_file(scan: Scan) -> dict:
+    return {name: np.asarray(values) for name, values in scan.rows.columns.items()}
+
+
+def put_pcd(path, with_nan: bool = False) -> dict:
+    """Write a driver's PCD: intensity to 255, rings from the bottom, times in 64 bits, and a placeholder."""
+    scan = unproject(street(SIXTEEN))
+    columns = {axis: scan.points_xyz_m[:, at].numpy().copy() for at, axis in enumerate("xyz")}
+    if with_nan:
+        columns["x"][5] = columns["y"][5] = columns["z"][5] = np.nan
+    columns["intensity"] = (255 * scan.reflectance).round().numpy()
+    columns["ring"] = (15 - scan.ring).numpy().astype(np.uint16)
+    columns["timestamp"] = 1.6e9 + np.arange(len(scan)) * 1e-6
+    columns["return_type"] = (np.arange(len(scan)) % 3).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Pcd.write_columns(path, columns)
+    return columns
+
+
+def test_a_file_keeps_all_its_rows_and_columns_bit_for_bit(tmp_path):
+    before = put_pcd(tmp_path / "in/a.pcd", with_nan=True)
+    words = ["upsample", f"{tmp_path}/in", f"{tmp_path}/out", "--sensor", "vlp16", "--to", "pandar64"]
+    assert main([*words, "--model", "nearest", "--bad-points", "drop"]) == 0
+    after = columns_of_file(read_scan(tmp_path / "out/a.pcd", bad_points="drop"))
+    count = len(before["x"])
+    assert set(after) == {*before, "filled"}
+    for name, values in before.items():
+        assert after[name][:count].tobytes() == values.tobytes(), name
+        assert after[name].dtype == values.dtype
+    assert not after["filled"][:count].any()
+    assert after["filled"][count:].all()
+    assert len(after["x"]) > 1.5 * count
+    assert after["ring"].max() == 15
+    assert set(after["timestamp"]) <= set(before["timestamp"]), "of the nearest measured point"
+    assert 0 < after["intensity"][count:].max() <= 255
+
+
+def test_time_and_other_columns_go_into_another_format(tmp_path):
+    before = put_pcd(tmp_path / "in/a.pcd")
+    words = [
+        "upsample",
+        f"{tmp_path}/in",
+        f"{tmp_path}/out",
+        "--sensor",
+        "vlp16",
+        "--to",
+        "pandar64",
+        "--format",
+        "npz",
+    ]
+    assert main([*words, "--model", "nearest"]) == 0
+    with np.load(tmp_path / "out/a.npz") as after:
+        count = len(before["x"])
+        assert np.array_equal(after["points"][:count], np.stack([before[axis] for axis in "xyz"], 1))
+        assert np.array_equal(after["timestamp"][:count], before["timestamp"])
+        assert after["filled"].sum() == len(after["points"]) - count > 0
+
+
+@pytest.mark.parametrize("ending", [".bin", ".npy", ".npz", ".ply", ".csv", ".pcd"])
+def test_own_output_is_read_back_and_seen_without_loss(ending, tmp_path, capsys):
+    scan = unproject(street(DENSE.fine()))
+    fired = torch.argsort(
+        scan.ring * 10 + torch.atan2(scan.points_xyz_m[:, 1], scan.points_xyz_m[:, 0]) % (2 * math.pi)
+    )
+    scan = Scan(scan.points_xyz_m[fired], scan.reflectance[fired], scan.ring[fired])
+    (tmp_path / "sensor.json").write_text(json.dumps(DENSE.fine().to_json()))
+    next(one for one in formats.candidates(tmp_path / f"a{ending}")).write(tmp_path / f"in/a{ending}", scan)
+    before = read_scan(tmp_path / f"in/a{ending}")
+    words = ["complete", f"{tmp_path}/in", f"{tmp_path}/out", "--model", "triangulation"]
+    assert main([*words, "--sensor", f"{tmp_path}/sensor.json"]) == 0
+    told = capsys.readouterr().out
+    after = read_scan(tmp_path / f"out/a{ending}")
+    assert torch.equal(after.points_xyz_m[: len(before)], before.points_xyz_m)
+    assert torch.equal(after.reflectance[: len(before)], before.reflectance)
+    filled = len(after) - len(before)
+    assert after.filled.tolist() == [False] * len(before) + [True] * filled
+    assert f"{len(after):,} points, {len(before):,} measured and {filled:,} filled" in told
+    assert f"lidargrit view {tmp_path}/out" in told
+    (shown,) = load_scan_sets([f"{tmp_path}/out"], 1, settings=ScanSettings(), all_columns=True)
+    assert int(shown.images.return_mask.sum()) == len(after), "each point has a pixel of its own"
+    assert int(shown.filled.sum()) == filled
+    assert main(["view", f"{tmp_path}/out", "-o", f"{tmp_path}/v.html"]) == 0
+    assert main(["view", f"{tmp_path}/out", "-o", f"{tmp_path}/v.png"]) == 0
+    assert "WARNING" not in capsys.readouterr().err
+    assert '"filled"' in (tmp_path / "v.html").read_text()
+
+
+def test_marks_that_do_not_fit_are_refused(tmp_path):
+    KittiBin.write(tmp_path / "a.bin", unproject(street(DENSE)))
+    (tmp_path / "a.filled").write_bytes(b"\1\0")
+    with pytest.raises(formats.ScanError, match=r"2 bytes up to 1 in .*a.filled; wanted a byte of 0 or 1 for each"):
+        read_scan(tmp_path / "a.bin")
+
+
+def test_nuscenes_keeps_its_own_file_with_the_rows_that_are_no_points(tmp_path):
+    sensor = load_sensor("hdl32e")
+    scan = unproject(street(sensor.with_columns(256)))
+    form = formats.load("nuscenes_bin")
+    form.write(tmp_path / "in/a.pcd.bin", scan)
+    rows = np.fromfile(tmp_path / "in/a.pcd.bin", "<f4").reshape(-1, 5)
+    rows[7, :3] = (0.1, 0.2, 0.05)  # a beam that did not return
+    rows.tofile(tmp_path / "in/a.pcd.bin")
+    words = ["upsample", f"{tmp_path}/in", f"{tmp_path}/out", "--to", "pandar64", "--model", "nearest"]
+    assert main([*words, "--sensor", "hdl32e"]) == 0
+    after = np.fromfile(tmp_path / "out/a.pcd.bin", "<f4").reshape(-1, 5)
+    assert after[: len(rows)].tobytes() == rows.tobytes()
+    assert len(after) > len(rows)
+    assert len(read_scan(tmp_path / "out/a.pcd.bin")) == len(after) - 1
+
+
+# Input that is none.
+
+
+@pytest.mark.parametrize("verb", ["complete", "raydrop"])
+@pytest.mark.parametrize(
+    ("what", "told"),
+    [
+        ("empty", "an empty file"),
+        ("nan", "with NaN or infinite coordinates"),
+        ("rolled", "outside the sensor's elevations"),
+        ("other", "16 rings in"),
+    ],
+)
+def test_input_that_cannot_be_used_is_told_in_one_line(verb, what, told, tmp_path, capsys):
+    xyz = unproject(street(DENSE.fine())).points_xyz_m.numpy()
+    if what == "empty":
+        xyz = xyz[:0]
+    if what == "nan":
+        xyz[3] = np.nan
+    if what == "rolled":
+        xyz = np.ascontiguousarray(xyz[np.random.default_rng(0).permutation(len(xyz))][:, [0, 2, 1]])  # a camera's axes
+    rows = np.concatenate((xyz, np.zeros((len(xyz), 1), np.float32)), 1)
+    (tmp_path / "in").mkdir()
+    rows.astype("<f4").tofile(tmp_path / "in/a.bin")
+    if what == "other":
+        (tmp_path / "in/a.bin").unlink()
+        put_pcd(tmp_path / "in/a.pcd")
+    assert main([verb, f"{tmp_path}/in", f"{tmp_path}/out"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert told in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("change", ["turned", "mirrored"])
+def test_a_turned_or_mirrored_cloud_comes_back_whole(change):
+    scan = unproject(street(DENSE.fine()))
+    x, y, z = scan.points_xyz_m.T
+    points = torch.stack((-y, x, z) if change == "turned" else (x, -y, z), 1)
+    done = complete_scan(Scan(points, scan.reflectance), open_model("nearest", sensor=DENSE.fine()))
+    assert torch.equal(done.whole().points_xyz_m[: len(points)], points)
