@@ -35,7 +35,7 @@ METRICS = {"sliced_wasserstein": "textbook", "point_cloud_jsd": "exact", "return
 def seconds_per_scan(generator: Generator, sampling: object, batch: int) -> float:
     """Return the time, the least of three for a scan at a time; the first call, which prepares, is not counted."""
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
-    work, times = partial(generator.sample, range(batch), sampling), []
+    work, times = partial(generator.sample, range(batch), sampling=sampling), []
     work()
     for _ in range(3 if batch == 1 else 1):
         begun = clock()

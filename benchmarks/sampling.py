@@ -156,7 +156,7 @@ def main() -> None:
         plain = recomputed + batch * plain_decoding
         for weights, decoder in (("fp32", "fp32"), ("int8" if batch == 1 else "bf16", "bf16")):
             sampling = TokenSampling(guidance=1.0, weights=weights, decoder=decoder)
-            whole = seconds(partial(generator.sample, range(batch), sampling))
+            whole = seconds(partial(generator.sample, range(batch), sampling=sampling))
             print(
                 f"whole scans, batch {batch:<4}weights {weights}, decoder {decoder}{whole:9.2f} s  plain{plain:9.1f} s"
                 f"{plain / whole:8.1f} times{60 * batch / whole:8.1f} scans a minute",

@@ -72,7 +72,7 @@ def ours(
         tokenizer.decoder.compile()
     uniform = torch.rand(batch, generator.transformer.context_length, device=device)
     tokens = seconds(partial(decoder.generate, uniform), device)
-    return [tokens, seconds(partial(generator.sample, range(batch), sampling), device)]
+    return [tokens, seconds(partial(generator.sample, range(batch), sampling=sampling), device)]
 
 
 def main() -> None:

@@ -27,8 +27,12 @@ def measured(wall_right_m):
     return rows.astype(np.float32).tobytes()
 
 
+def lines_of_page():
+    return re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+
+
 def test_the_pages_lines_give_one_point_to_every_pixel_and_keep_left_and_right(tmp_path, monkeypatch):
-    record, describe = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    record, describe, _ = lines_of_page()
     monkeypatch.setitem(sys.modules, "carla", ModuleType("carla"))
     monkeypatch.chdir(tmp_path)
     recording: dict = {}
@@ -41,3 +45,15 @@ def test_the_pages_lines_give_one_point_to_every_pixel_and_keep_left_and_right(t
     right = torch.sin(sensor.azimuth_rad[0]) < -0.51  # azimuth is positive to the left
     assert torch.allclose(image.range_m[:, right], torch.tensor(5.0))
     assert torch.allclose(image.range_m[:, torch.sin(sensor.azimuth_rad[0]) > -0.49], torch.tensor(20.0))
+
+
+def test_the_callback_keeps_some_of_the_points_as_they_are_and_turns_right_to_left():
+    callback: dict = {}
+    exec(lines_of_page()[2], callback)
+    raw = measured(wall_right_m=5.0)
+    kept = callback["on_scan"](SimpleNamespace(raw_data=raw))
+    sent = {row.tobytes() for row in np.frombuffer(raw, np.float32).reshape(-1, 4) * np.float32([1, -1, 1, 1])}
+    assert {row.tobytes() for row in kept} < sent
+    assert 0.3 < len(kept) / (CHANNELS * COLUMNS) < 1
+    across = np.hypot(*kept[:, :2].T)
+    assert (across[kept[:, 1] < -0.55 * across] < 5.1).all(), "the wall is on the right, which is negative y"

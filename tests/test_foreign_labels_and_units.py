@@ -7,9 +7,8 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import read_scan
-from lidargrit.data.formats.shared.labels import SEMANTIC_KITTI
 from lidargrit.data.sources import open_source
-from lidargrit.scans.classes import CLASSES, names_and_colours
+from lidargrit.scans.classes import names_and_colours
 from lidargrit.scans.sensors import load_sensor
 from street_corner import corner, xyz_of
 
@@ -27,10 +26,6 @@ def tree(folder, labels):
     (place / "velodyne" / "000000.bin").write_bytes(rows.tobytes())
     (place / "labels" / "000000.label").write_bytes(labels.astype("<u4").tobytes())
     return str(folder)
-
-
-def test_both_lists_of_classes_are_one():
-    assert CLASSES.keys() == SEMANTIC_KITTI
 
 
 def test_labels_of_another_numbering_are_told_and_get_no_names(tmp_path, capsys):

@@ -73,9 +73,11 @@ def known_of(generator, images):
 
 
 def scans_of(generator, seeds, sampling):
-    """Return new scans, or completions of one scan by a generator that has no new ones."""
+    """Return new scans, or one scan that is completed or labelled by a generator that has no new ones."""
     if Nothing in generator.takes:
         return generator.sample(seeds, sampling=sampling)
+    if not generator.takes:  # it has no scans at all, and labels them
+        return generator.segment(IMAGES.batch([0] * len(seeds)))
     return generator.complete(known_of(generator, IMAGES.batch([0] * len(seeds))), seeds, sampling)
 
 
@@ -91,6 +93,8 @@ def same(one: RangeImage, other: RangeImage) -> bool:
     pairs = [(one.range_m, other.range_m), (one.return_mask, other.return_mask)]
     if one.reflectance is not None:
         pairs.append((one.reflectance, other.reflectance))
+    if one.label is not None:
+        pairs.append((one.label, other.label))
     return all(torch.equal(*pair) for pair in pairs)
 
 
@@ -337,7 +341,9 @@ def test_an_objective_has_a_finite_loss_and_gradients(name):
         objective = generator.objective(stage).train()
         for player in objective.players or ("",):
             rng = torch.Generator().manual_seed(0)
-            objective(Example(IMAGES.batch([0, 1])), rng, player)["loss"].backward()
+            images = IMAGES.batch([0, 1])
+            labelled = images.with_planes(label=torch.where(images.return_mask, 40, 0))
+            objective(Example(labelled), rng, player)["loss"].backward()
         gradients = [weight.grad for weight in objective.parameters() if weight.grad is not None]
         assert gradients
         assert all(bool(gradient.isfinite().all()) for gradient in gradients)

@@ -15,11 +15,10 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.generation.generator import load
-from lidargrit.generation.semantic_classes import CLASSES, class_indices, labels_of
+from lidargrit.scans.classes import LEARNED
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.fills import fill, fill_lacking
-from lidargrit.scans.labels import LABELS, OTHER_OBJECT, OTHER_STRUCTURE
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
@@ -62,14 +61,6 @@ def folders(tmp_path_factory):
     torch.manual_seed(0)
     save_bundle(root / "run", SENSOR, NETWORK, RAYDROP)
     return root
-
-
-def test_the_simulator_has_no_label_that_is_forgotten():
-    unlearned = {number for number in LABELS if not int(class_indices(torch.tensor(number)))}
-    assert unlearned == {OTHER_STRUCTURE, OTHER_OBJECT}
-    numbers = [number for several in CLASSES.values() for number in several]
-    assert len(numbers) == len(set(numbers))
-    assert labels_of(class_indices(torch.tensor([0, 1, ROAD, MOVING_CAR, 9999]))).tolist() == [0, 0, ROAD, 10, 0]
 
 
 def test_a_pixel_has_the_class_of_its_point_through_projection_and_preparation(folders, tmp_path):
@@ -163,7 +154,7 @@ def test_a_labelled_tree_is_completed_as_a_labelled_tree(folders, tmp_path, caps
     ]
     assert len(same) > 300
     assert all(same)  # with their instances
-    assert set((after.label & 0xFFFF).tolist()) <= {0, *(numbers[0] for numbers in CLASSES.values())}
+    assert set((after.label & 0xFFFF).tolist()) <= {0, *LEARNED}
     capsys.readouterr()
     assert main([*words[:2], str(tmp_path / "bin"), *words[3:], "--device", "cpu"]) == 0
     assert ".bin keeps no labels; --format kitti_odometry or npz keeps them" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, UnknownNameError
 from lidargrit.evaluation.metrics import Metric, load_metric
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
+from lidargrit.evaluation.metrics.shared.labelled import LabelMetric
 from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import MetricResult, RangeImage
@@ -24,7 +25,7 @@ SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128)
 SMALL = replace(SENSOR, elevation_rad=SENSOR.elevation_rad[::8]).with_columns(32)
 
 # Noise of 3 m is too little for cells of 1.6 m and accuracies in steps of 1 in 32; but surfaces are gone long before.
-NOISE_M = {"flying_points": (0.3, 1.0), "wall_straightness": (0.05, 0.2)}
+NOISE_M = {"flying_points": (0.3, 1.0), "object_statistics": (0.6, 1.5), "wall_straightness": (0.05, 0.2)}
 
 pytestmark = [pytest.mark.parametrize(("name", "variant"), CASES)]
 
@@ -35,7 +36,9 @@ def _network(name, monkeypatch):
 
     Images are looked at one by one, so that an image that was seen before need not be looked at again.
     """
-    if load_metric(name).needs_weights:
+    if issubclass(load_metric(name), LabelMetric):
+        monkeypatch.setattr(sys.modules[LabelMetric.__module__], "segmenter_of", lambda sensor, named: None)
+    elif load_metric(name).needs_weights:
         monkeypatch.setenv("LIDARGRIT_WEIGHTS", str(weights_folder()))
         monkeypatch.setattr(PretrainedNetwork, "_forward", seen_once)
         monkeypatch.setattr(sys.modules[__name__], "SENSOR", SMALL)
@@ -63,6 +66,8 @@ def scenes(seed, count=10, walls=6, drop_share=0.1, noise_m=0.0):
         :, None, : SENSOR.width
     ]
     shift = int(torch.randint(128, (1,), generator=rng))
+    of_wall = torch.tensor([10, 50, 80, 70, 30, 71]).repeat(walls)[:walls].repeat_interleave(SENSOR.width // walls + 1)
+    label = torch.where(ground_m < wall_m, 40, of_wall[: SENSOR.width]).roll(shift, dims=2)
     range_m = torch.minimum(ground_m, wall_m).roll(shift, dims=2)
     mask = torch.rand(range_m.shape, generator=rng) > drop_share
     noise = torch.randn(range_m.shape, generator=torch.Generator().manual_seed(seed + 1000)) * noise_m
@@ -70,7 +75,7 @@ def scenes(seed, count=10, walls=6, drop_share=0.1, noise_m=0.0):
     mask &= (noisy_m >= SENSOR.range_min_m) & (noisy_m <= SENSOR.range_max_m)
     reflectance = ((range_m / 100 + drop_share) + noise / 50).clamp(0, 1)
     range_m = noisy_m.clamp(SENSOR.range_min_m, SENSOR.range_max_m)
-    return RangeImage(torch.where(mask, range_m, 0), mask, SENSOR, {"reflectance": torch.where(mask, reflectance, 0)})
+    return RangeImage.masked(range_m, mask, SENSOR, {"reflectance": reflectance, "label": label})
 
 
 def score(name, variant, generated, real, **options):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import materials
 from lidargrit.simulator.beams import Beams
@@ -110,7 +110,7 @@ def test_probability_is_that_of_a_log_normal_factor():
 
 
 def test_gaps_are_part_of_the_probability(seen):
-    near_wall = (seen[0].label == labels.BUILDING) & (seen[0].clean_range_m < 25) & ~seen[0].blocked
+    near_wall = (seen[0].label == classes.BUILDING) & (seen[0].clean_range_m < 25) & ~seen[0].blocked
     share = np.mean([s.return_mask[near_wall].mean() for s in seen])
     said = np.mean([s.return_probability[near_wall].mean() for s in seen])
     assert share == pytest.approx(said, abs=0.003)
@@ -135,7 +135,7 @@ def test_dark_bodies_drop_at_grazing_incidence_and_white_walls_do_not():
         low, high = np.array([15, 0, -4]), np.array([15, 0, 6])
         front = quad(low - aside, low + aside, high + aside, high - aside)
         scene = look(
-            ToyScene(Mesh.of(front, material, albedo, labels.CAR, 1)), model=replace(NO_GAPS, object_spread=0.0)
+            ToyScene(Mesh.of(front, material, albedo, classes.CAR, 1)), model=replace(NO_GAPS, object_spread=0.0)
         )
         return scene.return_mask[:30][scene.instance[:30] == 1].mean()
 
@@ -173,7 +173,7 @@ def test_drops_stand_in_patches(seen):
     for s in seen:
         drop = ~s.return_mask & ~s.blocked
         pair = (s.label[:, 1:] == s.label[:, :-1]) & (s.return_probability[:, 1:] > 0) & (s.clean_range_m[:, 1:] > 30)
-        pair &= (s.label == labels.ROAD)[:, 1:]
+        pair &= (s.label == classes.ROAD)[:, 1:]
         dropped.append(drop[:, 1:][pair])
         alike.append((drop[:, 1:] & drop[:, :-1])[pair])
     rate, both = np.concatenate(dropped).mean(), np.concatenate(alike).mean()
@@ -238,7 +238,7 @@ def test_measured_range_is_noisy_and_clean_range_is_not(seen):
     assert difference.std() == pytest.approx(MODEL.range_sigma_m, rel=0.05)
     assert abs(difference.mean()) < 1e-3
     assert (one.range_m[~one.return_mask] == 0).all()
-    flat = (one.label == labels.ROAD) & (one.clean_range_m > 5) & (one.clean_range_m < 12)
+    flat = (one.label == classes.ROAD) & (one.clean_range_m > 5) & (one.clean_range_m < 12)
     height = one.directions[..., 2] * one.clean_range_m
     assert np.abs(height[flat] + HEIGHT_M).mean() < 5e-3  # but for edges
 
@@ -267,13 +267,13 @@ def test_reflectance_follows_albedo_until_the_echo_is_weak():
     scene = look(ToyScene(road(), wall(20.0, 0.6)))
     near = scene.return_mask & (scene.clean_range_m < 22) & (scene.cos_incidence > 0.1)
     asphalt, plaster = (materials.MATERIALS[m].diffuse for m in (materials.ASPHALT, materials.PLASTER))
-    means = [scene.reflectance[near & (scene.label == label)].mean() for label in (labels.ROAD, labels.BUILDING)]
+    means = [scene.reflectance[near & (scene.label == label)].mean() for label in (classes.ROAD, classes.BUILDING)]
     assert means == pytest.approx([0.26 * asphalt, 0.6 * plaster], abs=0.06)
 
 
 def test_boxes_have_their_own_class_and_number():
-    car = Mesh.of(box((10, 0, 0.8), (4, 2, 1.2)), materials.PAINT, 0.3, labels.CAR, 7)
+    car = Mesh.of(box((10, 0, 0.8), (4, 2, 1.2)), materials.PAINT, 0.3, classes.CAR, 7)
     scene = look(ToyScene(road(), car))
-    assert set(np.unique(scene.label)) == {0, labels.ROAD, labels.CAR}
-    assert (scene.instance[scene.label == labels.CAR] == 7).all()
-    assert (scene.instance[scene.label == labels.ROAD] == 0).all()
+    assert set(np.unique(scene.label)) == {0, classes.ROAD, classes.CAR}
+    assert (scene.instance[scene.label == classes.CAR] == 7).all()
+    assert (scene.instance[scene.label == classes.ROAD] == 0).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.layout import driving, parked
@@ -17,7 +17,7 @@ from lidargrit.simulator.scene.vehicles import make_vehicles
 
 THEMES = ("city", "suburb", "country")
 SEEDS = range(12)
-CARS = (labels.CAR, labels.MOVING_CAR, labels.TRUCK, labels.MOVING_TRUCK)
+CARS = (classes.CAR, classes.MOVING_CAR, classes.TRUCK, classes.MOVING_TRUCK)
 FIELDS = ("triangles_m", "material", "albedo", "label", "instance")
 
 
@@ -68,22 +68,22 @@ def test_triangles_are_sound(meshes):
 
 def test_labels_materials_and_brightness_are_in_range(meshes):
     for mesh in meshes.values():
-        assert set(np.unique(mesh.label)) <= labels.LABELS
+        assert set(np.unique(mesh.label)) <= classes.LABELS
         assert mesh.material.max() < len(materials.MATERIALS)
         assert mesh.albedo.min() > 0
         assert mesh.albedo.max() < 0.9
         leaves = mesh.albedo[mesh.material == materials.LEAVES]
         assert 0.2 < leaves.min() <= leaves.max() <= 0.6
-        asphalt = mesh.albedo[mesh.label == labels.ROAD]
+        asphalt = mesh.albedo[mesh.label == classes.ROAD]
         assert 0.08 < asphalt.min() <= asphalt.max() < 0.3
 
 
 def test_things_have_instances_and_the_ground_has_none(meshes):
-    things = (*CARS, labels.PERSON, labels.MOVING_PERSON, labels.BICYCLIST, labels.MOVING_BICYCLIST)
+    things = (*CARS, classes.PERSON, classes.MOVING_PERSON, classes.BICYCLIST, classes.MOVING_BICYCLIST)
     for mesh in meshes.values():
         is_thing = np.isin(mesh.label, things)
         assert (mesh.instance[is_thing] > 0).all()
-        assert (mesh.instance[np.isin(mesh.label, (labels.ROAD, labels.BUILDING, labels.VEGETATION))] == 0).all()
+        assert (mesh.instance[np.isin(mesh.label, (classes.ROAD, classes.BUILDING, classes.VEGETATION))] == 0).all()
         pairs = np.unique(mesh.instance[mesh.instance > 0] * 1000 + mesh.label[mesh.instance > 0])
         assert len(np.unique(pairs // 1000)) == len(pairs)  # one class to an instance
 
@@ -108,7 +108,7 @@ def test_the_sensor_stands_over_the_road(scenes):
         way = np.linalg.norm(later[:3, 3] - start[:3, 3])
         assert way == pytest.approx(scene.speed_m_s, rel=0.05, abs=0.01)
         mesh = scene.mesh()
-        road = mesh.triangles_m[mesh.label == labels.ROAD].mean(axis=1)
+        road = mesh.triangles_m[mesh.label == classes.ROAD].mean(axis=1)
         below = road[np.hypot(road[:, 0], road[:, 1]) < 2.5]
         assert np.abs(below[:, 2]).max() < 0.25
 
@@ -151,7 +151,7 @@ def test_houses_have_windows(meshes):
         area = np.linalg.norm(normal, axis=1) / 2
         near = np.hypot(*mesh.triangles_m.mean(axis=1)[:, :2].T) < 30
         upright = np.abs(normal[:, 2]) < 0.1 * 2 * area
-        facade = (mesh.label == labels.BUILDING) & upright & near
+        facade = (mesh.label == classes.BUILDING) & upright & near
         glass = facade & (mesh.material == materials.GLASS)
         shares.append(area[glass].sum() / area[facade].sum())
     assert 0.03 < np.mean(shares) < 0.3
@@ -222,7 +222,7 @@ def test_what_moves_moves_and_the_rest_stays(scenes):
         assert np.array_equal(one.label, two.label)
         assert np.array_equal(one.instance, two.instance)
         way = np.linalg.norm(two.triangles_m.mean(axis=1) - one.triangles_m.mean(axis=1), axis=1)
-        moving = one.label >= labels.MOVING_CAR
+        moving = one.label >= classes.MOVING_CAR
         assert (way[~moving] == 0).all()
         assert (way[moving] > 0.3).all()
         moved += len(np.unique(one.instance[moving]))

@@ -8,7 +8,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.projection.unfolding import rings_from_firing_order
 from lidargrit.scans.sensors import load_sensor
@@ -96,10 +96,10 @@ def test_every_point_has_its_own_pixel(name):
 def test_points_carry_label_and_instance(seen, sensor):
     scan, image = simulate(0, sensor.with_columns(1024)), seen[0]
     assert scan.label.dtype == torch.int64
-    assert set((scan.label & 0xFFFF).unique().tolist()) <= labels.LABELS
+    assert set((scan.label & 0xFFFF).unique().tolist()) <= classes.LABELS
     for part, all_pixels in ((scan.label & 0xFFFF, image.label), (scan.label >> 16, image.instance)):
         assert sorted(part.tolist()) == sorted(all_pixels[image.return_mask].tolist())
-    cars = (scan.label & 0xFFFF) == labels.CAR
+    cars = (scan.label & 0xFFFF) == classes.CAR
     assert (scan.label[cars] >> 16 > 0).all()
 
 
@@ -121,7 +121,7 @@ def test_frames_are_a_drive_through_one_street():
     assert 0.5 < way_m < 25
 
     def standing(s):  # in the scene's frame
-        use = (s.label == labels.BUILDING) & (s.clean_range_m > 0)
+        use = (s.label == classes.BUILDING) & (s.clean_range_m > 0)
         points = s.directions[use].astype(np.float64) * s.clean_range_m[use][:, None]
         return points @ s.sensor_pose[:3, :3].T + s.sensor_pose[:3, 3]
 
@@ -155,15 +155,15 @@ def test_drops_depend_on_material_and_range(seen):
     def lost(use):
         return np.mean(np.concatenate([~s.return_mask[use(s) & ~s.blocked] for s in seen]))
 
-    ground = (labels.ROAD, labels.SIDEWALK, labels.TERRAIN, labels.PARKING, labels.LANE_MARKING)
+    ground = (classes.ROAD, classes.SIDEWALK, classes.TERRAIN, classes.PARKING, classes.LANE_MARKING)
     far = [
         lost(lambda s, low=low: np.isin(s.label, ground) & (s.clean_range_m > low) & (s.clean_range_m <= low + 20))
         for low in (5, 25, 60)
     ]
     assert far[0] < 0.05
     assert far[0] < far[1] < far[2]
-    near_cars = lost(lambda s: np.isin(s.label, (labels.CAR, labels.MOVING_CAR)) & (s.clean_range_m < 25))
-    near_houses = lost(lambda s: (s.label == labels.BUILDING) & (s.clean_range_m < 25))
+    near_cars = lost(lambda s: np.isin(s.label, (classes.CAR, classes.MOVING_CAR)) & (s.clean_range_m < 25))
+    near_houses = lost(lambda s: (s.label == classes.BUILDING) & (s.clean_range_m < 25))
     assert near_cars > 2 * near_houses
 
 
@@ -179,9 +179,9 @@ def test_numbers_of_the_model_reach_the_scan(sensor):
 
 def test_wet_road_returns_less(sensor):
     dry, wet = (observe(0, sensor, wet=wet, kept_columns_only=True) for wet in (0.0, 1.0))
-    road = dry.label == labels.ROAD
+    road = dry.label == classes.ROAD
     assert wet.return_probability[road].mean() < dry.return_probability[road].mean()
-    elsewhere = np.isin(dry.label, (labels.VEGETATION, labels.TERRAIN)) & (dry.label == wet.label)
+    elsewhere = np.isin(dry.label, (classes.VEGETATION, classes.TERRAIN)) & (dry.label == wet.label)
     assert (dry.range_m == wet.range_m)[elsewhere].mean() > 0.97  # but for beams that meet the road as well
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import materials
 from lidargrit.simulator.beams import REVOLUTION_S, Beams, footprint
@@ -74,7 +74,7 @@ def test_hits_agree_with_a_slow_loop():
 def test_what_is_out_of_reach_is_never_met(elevations_deg):
     rng = np.random.default_rng(1)
     triangles = rng.uniform(-60, 60, (4000, 1, 3)) + rng.normal(0, 2, (4000, 3, 3))
-    mesh, pose = Mesh.of(triangles, materials.PLASTER, 0.4, labels.BUILDING), ToyScene(road()).sensor_pose()
+    mesh, pose = Mesh.of(triangles, materials.PLASTER, 0.4, classes.BUILDING), ToyScene(road()).sensor_pose()
     azimuth, elevation = rng.uniform(-np.pi, np.pi, 5000), np.radians(rng.uniform(*elevations_deg, 5000))
     flat = np.cos(elevation)
     directions = np.stack((flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=1)
@@ -136,7 +136,7 @@ def test_planes_have_no_edges_and_boxes_have():
     bare, _, _ = edge(road())
     assert bare[12:].sum() == 0  # below the horizon there is only the road
     found, triangle, range_m = edge(
-        road(), Mesh.of(box((15, 0, 1), (4, 4, 6)), materials.PLASTER, 0.3, labels.BUILDING)
+        road(), Mesh.of(box((15, 0, 1), (4, 4, 6)), materials.PLASTER, 0.3, classes.BUILDING)
     )
     on_box = triangle >= 2
     border = on_box[:, 1:] != on_box[:, :-1]

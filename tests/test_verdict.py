@@ -72,6 +72,27 @@ def test_a_metric_that_cannot_praise_can_convict():
     assert real.startswith("Against real scans: worse in 1 of 1 scores (bev_jsd)")
 
 
+def test_what_stands_there_is_told_first():
+    """Of a model whose poles are gone although every other score is good; also of scans that are too few."""
+    numbers = {
+        which: {kind: {"number_a_scan": number} for kind, number in zip(("vehicle", "pole"), each, strict=True)}
+        for which, each in {"generated": (4.0, 0.5), "real": (4.25, 4.875)}.items()
+    }
+    worse = score(0.9, 0.1, 0.8, metric="object_statistics", variant="segmented")
+    worse = replace(worse, result=replace(worse.result, details=numbers))
+    first, pixels, real = said(score(0.15, 0.1, 0.9), worse)
+    assert first == "Objects a scan, samples v reference: vehicle 4.0000 v 4.2500, pole 0.5000 v 4.8750."
+    assert pixels.startswith("Against pixel statistics: worse in 0 of 2 scores, better in 1 (bev_jsd), undecided in 1")
+    assert real == (
+        "Against real scans: worse in 1 of 2 scores (object_statistics), within noise in 1 (bev_jsd), undecided in 0."
+    )
+    both = said(score(1.5, 0.1, 0.9), worse)[2]
+    assert both.startswith("Against real scans: worse in 2 of 2 scores, ")
+    lost = said(score(1.5, 0.1, 0.9), score(0.15, 0.1, 0.9, metric="bev_mmd"), worse)[2]
+    assert lost.startswith("Against real scans: worse in 2 of 3 scores (object_statistics, bev_jsd), ")
+    assert verdict([worse], 24).sentences[0] == first
+
+
 def counted_slowly(scores):
     """Count losses and wins against pixel statistics by the definitions of the documentation, one score at a time."""
     counts = {"worse": 0, "better": 0, "undecided": 0}

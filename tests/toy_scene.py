@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.mesh import Mesh
 
@@ -28,12 +28,12 @@ def box(middle, size):
 
 def road(albedo=0.26):
     flat = quad((-300, -300, 0), (300, -300, 0), (300, 300, 0), (-300, 300, 0))
-    return Mesh.of(flat, materials.ASPHALT, albedo, labels.ROAD)
+    return Mesh.of(flat, materials.ASPHALT, albedo, classes.ROAD)
 
 
 def wall(x_m, albedo=0.4, material=materials.PLASTER, half_width_m=40.0):
     upright = quad((x_m, -half_width_m, -5), (x_m, half_width_m, -5), (x_m, half_width_m, 60), (x_m, -half_width_m, 60))
-    return Mesh.of(upright, material, albedo, labels.BUILDING)
+    return Mesh.of(upright, material, albedo, classes.BUILDING)
 
 
 class ToyScene:
@@ -61,10 +61,10 @@ def street(leaves=1500):
     crown = middles[:, None] + rng.normal(0, 0.1, (leaves, 3, 3))
     return ToyScene(
         road(),
-        Mesh.of(box((0, 15, 5), (200, 4, 10)), materials.PLASTER, 0.5, labels.BUILDING),
-        Mesh.of(box((8, -4, 0.8), (4.2, 1.7, 1.2)), materials.PAINT, 0.004, labels.CAR, 1),
-        Mesh.of(box((-12, -4, 0.8), (4.2, 1.7, 1.2)), materials.PAINT, 0.5, labels.CAR, 2),
-        Mesh.of(box((20, 3, 3), (0.05, 0.7, 0.7)), materials.FOIL, 0.5, labels.TRAFFIC_SIGN, 3),
-        Mesh.of(quad((-5, 6, 0), (5, 6, 0), (5, 6, 3), (-5, 6, 3)), materials.GLASS, 0.02, labels.BUILDING),
-        Mesh.of(crown, materials.LEAVES, 0.35, labels.VEGETATION),
+        Mesh.of(box((0, 15, 5), (200, 4, 10)), materials.PLASTER, 0.5, classes.BUILDING),
+        Mesh.of(box((8, -4, 0.8), (4.2, 1.7, 1.2)), materials.PAINT, 0.004, classes.CAR, 1),
+        Mesh.of(box((-12, -4, 0.8), (4.2, 1.7, 1.2)), materials.PAINT, 0.5, classes.CAR, 2),
+        Mesh.of(box((20, 3, 3), (0.05, 0.7, 0.7)), materials.FOIL, 0.5, classes.TRAFFIC_SIGN, 3),
+        Mesh.of(quad((-5, 6, 0), (5, 6, 0), (5, 6, 3), (-5, 6, 3)), materials.GLASS, 0.02, classes.BUILDING),
+        Mesh.of(crown, materials.LEAVES, 0.35, classes.VEGETATION),
     )

@@ -6,9 +6,41 @@ from typing import TYPE_CHECKING, Any
 from lidargrit.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from lidargrit.api import Observed, evaluate, inspect, load, load_scan, load_sensor, project, simulate, unproject
+    from lidargrit.api import (
+        Observed,
+        Scan,
+        complete,
+        evaluate,
+        inspect,
+        load,
+        load_scan,
+        load_sensor,
+        open_model,
+        project,
+        raydrop,
+        scan_from_points,
+        simulate,
+        unproject,
+        upsample,
+    )
 
-__all__ = ["Observed", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = [
+    "Observed",
+    "Scan",
+    "complete",
+    "evaluate",
+    "inspect",
+    "load",
+    "load_scan",
+    "load_sensor",
+    "open_model",
+    "project",
+    "raydrop",
+    "scan_from_points",
+    "simulate",
+    "unproject",
+    "upsample",
+]
 
 
 def __getattr__(name: str) -> Any:
@@ -16,3 +48,7 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'lidargrit' has no attribute {name!r}")
     return getattr(importlib.import_module("lidargrit.api"), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

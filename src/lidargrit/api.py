@@ -1,20 +1,47 @@
 """What ``import lidargrit`` offers, in one place."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
+from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.data.formats.shared.arrays import Points, scan_from_points, scan_of
+from lidargrit.data.run_folder import PACKAGED
+from lidargrit.data.sources import Source, open_source
+from lidargrit.data.sources.memory import MemorySource
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import load
-from lidargrit.scans.condition import Observed
-from lidargrit.scans.projection import inspect, project, unproject
-from lidargrit.scans.sensors import load_sensor
-from lidargrit.scans.types import Scan
+from lidargrit.inference.complete import Model, open_model
+from lidargrit.inference.complete.cloud import CompletedScan
+from lidargrit.inference.complete.tasks import AddRows, Drop, complete_scan
+from lidargrit.scans.condition import ConditionKind, Observed
+from lidargrit.scans.projection import inspect, unproject
+from lidargrit.scans.projection import project as project_scan
+from lidargrit.scans.projection.image import ProjectionVariant
+from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
 
-__all__ = ["Observed", "evaluate", "inspect", "load", "load_scan", "load_sensor", "project", "simulate", "unproject"]
+__all__ = [
+    "Observed",
+    "Scan",
+    "complete",
+    "evaluate",
+    "inspect",
+    "load",
+    "load_scan",
+    "load_sensor",
+    "open_model",
+    "project",
+    "raydrop",
+    "scan_from_points",
+    "simulate",
+    "unproject",
+    "upsample",
+]
 
 
 def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -32,21 +59,117 @@ def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse"
     return formats.read_scan(path, index, bad_points)
 
 
-def evaluate(
-    generated: str, reference: str, protocol: str = "exact", metrics: Sequence[str] = (), max_scans: int = 0
-) -> Scorecard:
-    """Score a folder of samples, or any source of scans, against another.
+def project(
+    points: Points,
+    sensor: SensorModel | str,
+    method: ProjectionName | None = None,
+    variant: ProjectionVariant = "exact",
+    partial: bool = False,
+) -> RangeImage:
+    """Return the range image of a scan: each point in the pixel whose ray it lies on, the nearest first.
 
     Args:
-        generated: a folder of samples, of ours or of another program, or a source of scans.
+        points: scan, or its points as an array (n, 3) or (n, 4) in metres.
+        sensor: sensor with the rays of the image, or its name (``lidargrit list sensors``).
+        method, variant, partial: settings of :func:`lidargrit.scans.projection.project`.
+    """
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    return project_scan(scan_of(points), sensor, method, variant, partial)
+
+
+def complete(points: Points, model: str | Model = "pretrained", seed: int = 0) -> CompletedScan:
+    """Fill in every ray of a scan that has no point, and keep all points as they are.
+
+    Args:
+        points: scan, or its points as an array (n, 3) or (n, 4) in metres.
+        model: run that completes scans, or what :func:`open_model` returned; open a run once for many scans.
+        seed: seed of what is sampled.
+
+    Returns:
+        the points that stay and those that were added; ``whole()`` gives one scan whose ``filled`` marks the added.
+
+    Raises:
+        ScanError: points that cannot be used, or of another sensor than the model's.
+
+    Example::
+
+        whole = lidargrit.complete(points).whole()
+        whole.points_xyz_m[~whole.filled]  # the measured points, bit for bit
+    """
+    return complete_scan(scan_of(points), _opened(model, "pixels"), None, seed)
+
+
+def upsample(
+    points: Points, sensor: SensorModel | str, model: str | Model = "pretrained", seed: int = 0
+) -> CompletedScan:
+    """Add the rows that a sensor with few of them lacks, and keep all points as they are.
+
+    Args:
+        points: scan, or its points as an array (n, 3) or (n, 4) in metres.
+        sensor: sensor that made the scan, or its name, such as ``vlp16``.
+        model, seed: arguments of :func:`complete`; the model has the rows that are added.
+    """
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    return complete_scan(scan_of(points), _opened(model, "pixels"), AddRows(sensor), seed)
+
+
+def raydrop(points: Points, model: str | Model = "pretrained", seed: int = 0) -> CompletedScan:
+    """Drop returns of a clean scan, such as a simulator's, that a real sensor would not get.
+
+    Args:
+        points: scan, or its points as an array (n, 3) or (n, 4) in metres.
+        model, seed: arguments of :func:`complete`.
+
+    Returns:
+        the scan; ``kept`` is True for each point that returns, ``whole()`` has these alone.
+
+    Example::
+
+        kept = lidargrit.raydrop(points).kept.numpy()
+    """
+    return complete_scan(scan_of(points), _opened(model, "surfaces"), Drop(), seed)
+
+
+def evaluate(
+    generated: str | Sequence[Points],
+    reference: str | Sequence[Points],
+    protocol: str = "exact",
+    metrics: Sequence[str] = (),
+    max_scans: int = 0,
+    sensor: SensorModel | str = "hdl64e_kitti_odometry",
+) -> Scorecard:
+    """Score a folder of samples, or any scans, against others.
+
+    Args:
+        generated: a folder of samples, of ours or of another program, a source of scans, or scans in memory.
         reference: a set to compare with, of the same kinds; its scans are projected with the sensor of ``generated``.
         protocol: name of the protocol, which chooses and defines the metrics (``lidargrit list protocols``).
         metrics: names of metrics, instead of the protocol's.
         max_scans: largest number of scans of each set; 0 for the protocol's.
+        sensor: sensor of scans in memory, or its name.
 
     Returns:
         scores with intervals, beside those of real scans against real scans: ``card.scores``, or
         ``print(card.as_table())`` for all of them.
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
-    return compare_sources(generated, reference, settings)[0]
+    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    first, second = (_source(each, sensor) for each in (generated, reference))
+    return compare_pair(open_pair(first, second, settings, Reporter()), settings)
+
+
+def _source(scans: str | Sequence[Points], sensor: SensorModel) -> Source:
+    if isinstance(scans, str):
+        return open_source(scans)
+    return MemorySource([scan_of(points) for points in scans], sensor)
+
+
+def _opened(model: str | Model, kind: ConditionKind) -> Model:
+    if isinstance(model, Model):
+        return model
+    return _packaged(model, kind) if model in {folder.name for folder in PACKAGED} else open_model(model, kind)
+
+
+@lru_cache
+def _packaged(name: str, kind: ConditionKind) -> Model:
+    return open_model(name, kind)

@@ -31,6 +31,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
+from lidargrit.scans.rescan import Rescan, Rescanned
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
@@ -47,6 +48,7 @@ def export_scans(
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
+    change: Rescan | None = None,
 ) -> int:
     """Write every scan of a source to a file of its own; files that are there already are not written again.
 
@@ -61,6 +63,7 @@ def export_scans(
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
+        change: what turns each scan into that of another sensor; scans stay as they are if not given.
 
     Returns:
         Number of scans that are there now.
@@ -78,15 +81,22 @@ def export_scans(
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     check_names(source, files)
-    facts = {"source": source, "format": kind, **of_images}
+    facts = {"source": source, "format": kind, **of_images, **(change.identity() if change else {})}
     facts["scans"] = {file: scans.identity(index) for index, file in enumerate(files)}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
         told_labels, missing = layout.keeps_labels, _missing(out, files)
-        told = _told_notes(source, scans.notes, set(), reporter)
+        told, told_rays = _told_notes(source, scans.notes, set(), reporter), False
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
                 try:
-                    layout.write(files[index], scan := scans.scan(index))
+                    scan = scans.scan(index)
+                    if change is not None:
+                        seen = change(scan)
+                        told = _told_notes(
+                            change.other.name, [_told_rays(seen)] if not told_rays else [], told, reporter
+                        )
+                        told_rays, scan = True, seen.scan
+                    layout.write(files[index], scan)
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
@@ -99,6 +109,12 @@ def export_scans(
         if len(left_out) == len(files):
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
         return len(files) - len(left_out)
+
+
+def _told_rays(seen: Rescanned) -> str:
+    """Return how many rays of another sensor get a point of the first scan."""
+    look = f"; {seen.without_rows:,} look where the scans have no rows" if seen.without_rows else ""
+    return f"{len(seen.scan):,} of {seen.rays:,} rays get a point of the first scan{look}"
 
 
 def _told_notes(of: str, notes: Sequence[str], told: set[str], reporter: Reporter) -> set[str]:

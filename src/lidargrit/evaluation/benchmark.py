@@ -378,8 +378,8 @@ def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig, r
             continue
         with suppress(LidarGritError):  # still no weights, or images that this network cannot see
             metric = metric_factory(choice, settings, reporter)()
-            if metric.weights_sha256 != sha256:
-                for images, real in ((pair.samples, False), (pair.reference, True)):
-                    metric.update(images.batch([0]), real=real)
+            for images, real in ((pair.samples, False), (pair.reference, True)):
+                metric.update(images.batch([0]), real=real)  # some know only now which weights these images need
+            if metric.weights_sha256 != (sha256 or ""):
                 return True
     return False

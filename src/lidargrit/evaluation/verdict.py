@@ -8,6 +8,8 @@ Every score table of this program knows three bounds, by these names alone:
   which samples every pixel by itself. A model must do better.
 - *memorised training scans*: scans of the generator ``memorised``. They score like real scans, and nothing is new.
 
+Metrics of what stands in scans are named first, and the number of objects a scan stands before all counts.
+
 A score counts as lost wherever its metric sees a difference. It counts as won only where the metric tells pixel
 statistics from real scans: of one that does not, a good score says little.
 """
@@ -73,15 +75,17 @@ class Verdict:
     Args:
         tallies: counts against each bound that is known; none where there is no verdict.
         remarks: sentences that belong to them, or say why there are none.
+        objects: sentence on the number of objects a scan; "" where they were not counted.
     """
 
     tallies: tuple[Tally, ...]
     remarks: tuple[str, ...]
+    objects: str = ""
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All that is said, losses first."""
-        return (*map(str, self.tallies), *self.remarks)
+        """All that is said, objects and losses first."""
+        return (*filter(None, [self.objects]), *map(str, self.tallies), *self.remarks)
 
 
 def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = (), leak: str = "") -> Verdict:
@@ -93,7 +97,8 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
         left_out: metrics that were asked for and could not be scored, which are undecided.
         leak: sentence about scans of the reference that the model learned from, or that both sets hold; "" for none.
     """
-    names = names_of([*map(column_of, scores), *left_out])
+    scores = sorted(scores, key=lambda score: not _sees_objects(score))
+    names, objects = names_of([*map(column_of, scores), *left_out]), objects_a_scan(scores)
     said = [f"{leak}."] if leak else []
     if below := [names[column_of(score)] for score in scores if score.result.value < 0]:
         said.append(
@@ -101,7 +106,7 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
             "do not differ; read it as 0."
         )
     if scans < ENOUGH:
-        return Verdict((), (too_few(scans), *said))
+        return Verdict((), (too_few(scans), *said), objects)
     by_pixels = {column_of(score): _standing(score, score.pixel_statistics) for score in scores}
     by_real = {column_of(score): _standing(score, _real(score)) for score in scores}
     seeing = {column_of(score) for score in scores if tells_apart(score)}
@@ -111,7 +116,7 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
     if any(stands is not None for stands in by_real.values()):
         tallies.append(_tally("Against real scans", by_real, (0, -1), seeing, names, "within noise"))
     if not tallies:
-        return Verdict((), (_NOTHING_KNOWN, *said))
+        return Verdict((), (_NOTHING_KNOWN, *said), objects)
     notes = [] if known_pixels else [_WITHOUT_PIXELS]
     if blind := [names[column_of(score)] for score in scores if tells_apart(score) is False]:
         notes.append(f"Pixel statistics pass for real scans in {', '.join(blind)}: no good score there is counted.")
@@ -122,7 +127,22 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
             f"Better than real against real: {', '.join(beyond)}. Either the samples repeat scans of the reference, or "
             "they vary less than real ones."
         )
-    return Verdict(tuple(tallies), (*notes, *said))
+    return Verdict(tuple(tallies), (*notes, *said), objects)
+
+
+def objects_a_scan(scores: Sequence[Score]) -> str:
+    """Return a sentence on the number of objects a scan in both sets; "" where no score counted them."""
+    for score in scores:
+        made, real = (score.result.details.get(name) for name in ("generated", "real"))
+        if score.result.metric == "object_statistics" and made and real:
+            number = "number_a_scan"
+            each = (f"{kind} {format_value(made[kind][number])} v {format_value(real[kind][number])}" for kind in real)
+            return f"Objects a scan, samples v reference: {', '.join(each)}."
+    return ""
+
+
+def _sees_objects(score: Score) -> bool:
+    return score.result.metric in discovery.names("metrics") and load_metric(score.result.metric).sees_objects
 
 
 def too_few(scans: int) -> str:

@@ -281,7 +281,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             kind, wanted = type(condition).__name__, ", ".join(sorted(one.__name__ for one in self.takes))
             got = "no condition" if isinstance(condition, Nothing) else f"a condition of type {kind}"
             cure = f"use it with: lidargrit {self.facts.first_command}"
-            raise ConfigError(f"{got} for {self.public_name()!r}", f"one of type {wanted}", cure)
+            wanted = f"one of type {wanted}" if wanted else "a generator that samples"
+            raise ConfigError(f"{got} for {self.public_name()!r}", wanted, cure)
 
     def _completed(self, known: Observed, seeds: Sequence[int], sampling: SamplingT | None) -> RangeImage:
         """Complete each scan, by the bundle's run for what was observed of it if there is one."""

@@ -1,8 +1,4 @@
-"""The classes that networks learn, those of SemanticKITTI's benchmark: numbers of labels ⇄ indices and channels.
-
-Source: Behley et al., SemanticKITTI, ICCV 2019: the 19 classes of its single-scan benchmark, in which what stands and
-what moves is one class. Other structures, other objects and outliers are none of them.
-"""
+"""The classes that networks learn, those of SemanticKITTI's benchmark: numbers of labels ⇄ indices and channels."""
 
 from typing import Final
 
@@ -11,34 +7,14 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.scans.classes import CLASSES, LEARNED
 
-CLASSES: Final[dict[str, tuple[int, ...]]] = {  # numbers of the labels of each; the first is written
-    "car": (10, 252),
-    "bicycle": (11,),
-    "motorcycle": (15,),
-    "truck": (18, 258),
-    "other vehicle": (20, 13, 16, 256, 257, 259),
-    "person": (30, 254),
-    "cyclist": (31, 253),
-    "motorcyclist": (32, 255),
-    "road": (40, 60),
-    "parking": (44,),
-    "pavement": (48,),
-    "other ground": (49,),
-    "building": (50,),
-    "fence": (51,),
-    "vegetation": (70,),
-    "trunk": (71,),
-    "terrain": (72,),
-    "pole": (80,),
-    "traffic sign": (81,),
-}
-NUM_CLASSES: Final = len(CLASSES)
+NUM_CLASSES: Final = len(LEARNED)
 # 0 for labels of no class, such as those that are not known; the last stands for all numbers from there on.
-_INDEX = torch.zeros(max(number for numbers in CLASSES.values() for number in numbers) + 2, dtype=torch.int64)
-for _index, _numbers in enumerate(CLASSES.values()):
-    _INDEX[list(_numbers)] = _index + 1
-_NUMBER = torch.tensor([0, *(numbers[0] for numbers in CLASSES.values())])
+_INDEX = torch.zeros(max(CLASSES) + 2, dtype=torch.int64)
+for _number, _class in CLASSES.items():
+    _INDEX[_number] = LEARNED.index(_class.learned) + 1 if _class.learned else 0
+_NUMBER = torch.tensor([0, *LEARNED])
 
 
 def class_indices(label: Int[Tensor, "*B"]) -> Int[Tensor, "*B"]:
@@ -77,8 +53,8 @@ def labels_to_learn(label: Int[Tensor, "B H W"] | None) -> Int[Tensor, "B H W"]:
     """Return the labels of training scans; refuse scans without them, with ConfigError."""
     if label is None:
         raise ConfigError(
-            "training scans without labels, for a network with labels=true",
+            "training scans without labels, for a network that learns them",
             "scans with labels, such as simulated:512:train",
-            "name such scans, or prepare them anew; or leave labels out",
+            "name such scans, or prepare them anew; or leave out labels=true, if you set it",
         )
     return label

@@ -1,8 +1,4 @@
-"""The data types that packages pass to one another: scan, range image, token grid, decoded scans, metric result.
-
-Each is valid once it exists. Ranges are always metres and the return mask is always True = a return. Normalised
-tensors live inside one model.
-"""
+"""The data types that packages pass to one another; ranges are metres, and a return mask is True = a return."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

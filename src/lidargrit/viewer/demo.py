@@ -1,7 +1,6 @@
 """The whole pipeline: scans → range images → trained networks → new scans → scores → one page."""
 
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -11,13 +10,12 @@ import torch
 
 from lidargrit.core.configuration import override
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import CheckpointError, DataError, counted_scans
+from lidargrit.core.errors import CheckpointError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
-from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import PRETRAINED, RUN_FILE, locate
-from lidargrit.data.sources import load_range_images, open_source
+from lidargrit.data.sources import load_range_images
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
@@ -33,6 +31,7 @@ from lidargrit.nn.random import rngs_of
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.training import check_folder, train
+from lidargrit.training.fine_tuning import divided
 from lidargrit.training.log import LOG_FILE, read_log
 from lidargrit.training.taken_stages import donors_of_stages
 from lidargrit.viewer import plot_comparison
@@ -219,41 +218,9 @@ def _packaged_samples(folder: Path, clock: "_Clock", reporter: Reporter) -> Rang
     return read_samples(folder, _PACKAGED_SCANS)
 
 
-def divided(data: str, reporter: Reporter) -> DataConfig:
-    """Divide a user's scans into train and val, by whole drives where there are several.
-
-    The same drive in both would leak. Held out is the drive that is nearest to 15 % of the scans; where there is only
-    one, its last scans are held out, and a warning says so.
-
-    Raises:
-        DataError: too few scans to hold any out.
-    """
-    dataset = open_source(data).scans()
-    if len(dataset) < 4:
-        raise DataError(f"{counted_scans(len(dataset))} in {data}", "at least 4, to hold one out", "add scans")
-    source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
-    scans = Counter(dataset.name(index).rpartition("/")[0] for index in range(len(dataset)))
-    drives = sorted(scans)
-    has_drives = dataset.public_name() != "folder" and all(drive and "/" not in drive for drive in drives)
-    if has_drives and len(drives) > 1 and "[" not in split:
-        held_out = min(reversed(drives), key=lambda drive: abs(scans[drive] / len(dataset) - 0.15))
-        train = f"{source}:{'+'.join(drive for drive in drives if drive != held_out)}"
-        val = f"{source}:{held_out}"
-    elif "[" in split:
-        raise DataError(
-            f"{data} with a share", "whole drives, or a folder", "leave the brackets out: demo divides the scans"
-        )
-    else:
-        reporter.message(
-            "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
-        )
-        train, val = f"{source}:{split}[:85%]", f"{source}:{split}[85%:]"
-    return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=_MAX_SCANS)
-
-
 def _preset(data: str | None, settings: list[str], reporter: Reporter, anew: bool) -> Preset:
     """Return the preset that suits the scans: from the model in the package, if that is wanted and has their rays."""
-    config = None if data is None else divided(data, reporter)
+    config = None if data is None else divided(data, reporter, _MAX_SCANS)
 
     def preset_of(name: str) -> Preset:
         preset = load_preset(name)

@@ -98,6 +98,8 @@ class Metric(ABC, Generic[Features, Kept]):
     """Name of the pretrained network whose features the metric compares; empty for most."""
     measures_raydrop: ClassVar[bool] = False
     """Whether the metric compares which rays return: it does not apply to a generator without raydrop."""
+    sees_objects: ClassVar[bool] = False
+    """Whether the metric looks at what stands in scans: a verdict names it before others."""
     fewest_images: ClassVar[int] = 2
     """Number of images that each set needs."""
     accumulator: type[Accumulator[Kept]]

@@ -145,7 +145,8 @@ def write_completions(
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
-    return Written(len(files) - len(left_out) * output.count, *counts.tolist(), sensor_file)
+    points = dict(zip(("points_in", "points_out", "points_filled"), counts.tolist(), strict=True))
+    return Written(len(files) - len(left_out) * output.count, sensor_file=sensor_file, **points)
 
 
 def _write_cloud(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, Num
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.shapes import MeshBuilder, boxes, owners, quads, rows_of
 from lidargrit.simulator.scene.street_plan import Poses, StreetPlan
@@ -132,7 +132,7 @@ def _add_wall_quads(builder: MeshBuilder, houses: Houses, walls: _Walls, which: 
     points = _on_wall(houses, walls, which, along, np.zeros_like(along), z)
     house = walls.house[which]
     builder.add(
-        quads(points), houses.wall_material[house][:, None], houses.wall_albedo[house][:, None], labels.BUILDING
+        quads(points), houses.wall_material[house][:, None], houses.wall_albedo[house][:, None], classes.BUILDING
     )
 
 
@@ -193,7 +193,7 @@ def _add_patches(
     room = np.where(rng.random(len(kind)) < _CURTAINED, rng.uniform(0.25, 0.6, len(kind)), 0.09)
     bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(0.15, 0.55, len(kind)))
     material = np.where(kind == _DOOR, materials.PAINT, materials.PLASTER)
-    builder.add(quads(points), material[:, None], bright[:, None], labels.BUILDING)
+    builder.add(quads(points), material[:, None], bright[:, None], classes.BUILDING)
 
 
 def _add_cells(
@@ -219,14 +219,14 @@ def _add_cells(
     outer, inner = (_on_wall(houses, walls, wall, along, np.broadcast_to(d, along.shape), z) for d in (deep * 0, deep))
     reveal = np.stack((outer, np.roll(outer, -1, 1), np.roll(inner, -1, 1), inner), axis=2)
     material, albedo = houses.wall_material[house][:, None, None], houses.wall_albedo[house][:, None, None]
-    builder.add(quads(reveal), material, albedo, labels.BUILDING)
+    builder.add(quads(reveal), material, albedo, classes.BUILDING)
     filling = np.array([materials.GLASS, materials.PLASTER, materials.PAINT])[kind]
     bright = np.where(kind == _PANE, 0.02, rng.uniform(0.15, 0.55, len(kind)))
-    builder.add(quads(inner), filling[:, None], bright[:, None], labels.BUILDING)
+    builder.add(quads(inner), filling[:, None], bright[:, None], classes.BUILDING)
     curtain = np.flatnonzero((kind == _PANE) & (rng.random(len(kind)) < _CURTAINED))  # cloth close behind the pane
     along, z = along[curtain], z[curtain]
     points = _on_wall(houses, walls, wall[curtain], along, np.full(along.shape, 0.25), z)
-    builder.add(quads(points), materials.CLOTH, rng.uniform(0.25, 0.6, (len(curtain), 1)), labels.BUILDING)
+    builder.add(quads(points), materials.CLOTH, rng.uniform(0.25, 0.6, (len(curtain), 1)), classes.BUILDING)
 
 
 def _add_insides(builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
@@ -237,7 +237,7 @@ def _add_insides(builder: MeshBuilder, rng: np.random.Generator, houses: Houses,
     half, top = half[some], houses.height_m[some] - 0.1
     inner = boxes(rows_of(-half[:, 0], -half[:, 1], -0.2), rows_of(half[:, 0], half[:, 1], top))
     dark = rng.uniform(0.03, 0.15, (len(some), 1))
-    builder.add(houses.poses.of(some).to_world(inner[:, :8]), materials.PLASTER, dark, labels.BUILDING)
+    builder.add(houses.poses.of(some).to_world(inner[:, :8]), materials.PLASTER, dark, classes.BUILDING)
 
 
 def _add_roofs(builder: MeshBuilder, rng: np.random.Generator, houses: Houses) -> None:
@@ -257,12 +257,12 @@ def _add_roofs(builder: MeshBuilder, rng: np.random.Generator, houses: Houses) -
     )
     tiles = houses.poses.to_world(quads(slopes))
     bright = rng.uniform(0.12, 0.35, (len(low), 1, 1))
-    builder.add(tiles, materials.BRICK, bright, labels.BUILDING)
+    builder.add(tiles, materials.BRICK, bright, classes.BUILDING)
     ends = np.stack(
         [np.stack((corner[1], corner[2], tops[1]), axis=1), np.stack((corner[3], corner[0], tops[0]), axis=1)], axis=1
     )
     gable = houses.poses.to_world(ends.astype(np.float32))
-    builder.add(gable, houses.wall_material[:, None], houses.wall_albedo[:, None], labels.BUILDING)
+    builder.add(gable, houses.wall_material[:, None], houses.wall_albedo[:, None], classes.BUILDING)
 
 
 def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
@@ -283,14 +283,14 @@ def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: House
     rail = boxes(rows_of(x - half, face - out, floor), rows_of(x + half, face - out + 0.06, floor + 0.95))
     balcony = np.stack((slab, rail), axis=1)[hung]
     builder.add(
-        houses.poses.of(home[hung]).to_world(balcony), materials.CONCRETE, albedo[hung][:, None, None], labels.BUILDING
+        houses.poses.of(home[hung]).to_world(balcony), materials.CONCRETE, albedo[hung][:, None, None], classes.BUILDING
     )
     steps = np.flatnonzero(kind > 0.75)
     step = boxes(rows_of(x - half, face - out, -_SINK_M), rows_of(x + half, face, 0.15 + 0.5 * kind))[steps]
-    builder.add(houses.poses.of(home[steps]).to_world(step), materials.CONCRETE, 0.3, labels.BUILDING)
+    builder.add(houses.poses.of(home[steps]).to_world(step), materials.CONCRETE, 0.3, classes.BUILDING)
     bays = np.flatnonzero((kind > 0.5) & (kind < 0.75))
     tall = houses.height_m[home] * np.where(half > 1.2, 1.0, 0.45)
     bay = boxes(rows_of(x - half, face - out * 0.6, -_SINK_M), rows_of(x + half, face + 0.05, tall))[bays]
     builder.add(
-        houses.poses.of(home[bays]).to_world(bay), material[bays][:, None], albedo[bays][:, None], labels.BUILDING
+        houses.poses.of(home[bays]).to_world(bay), material[bays][:, None], albedo[bays][:, None], classes.BUILDING
     )

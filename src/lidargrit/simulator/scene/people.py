@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import quads, tubes
@@ -48,7 +48,7 @@ def make_walkers(rng: np.random.Generator, placements: Placements, first_instanc
     """Sample people on foot, 1 to 1.95 m tall, most of them grown up."""
     tall = np.where(rng.random(len(placements)) < 0.12, rng.uniform(1.0, 1.5, len(placements)), 0.0)
     tall = np.where(tall > 0, tall, rng.normal(1.72, 0.08, len(placements)).clip(1.5, 1.95))
-    label = np.where(placements.speed_m_s != 0, labels.MOVING_PERSON, labels.PERSON)
+    label = np.where(placements.speed_m_s != 0, classes.MOVING_PERSON, classes.PERSON)
     limbs, material, albedo = _limbs(rng, _WALKER, tall, rng.uniform(0.9, 1.25, len(placements)))
     return _object_batch(limbs, material, albedo, label, placements, first_instance)
 
@@ -60,10 +60,10 @@ def make_cyclists(
     count = len(placements)
     bicycle, material, albedo = _bicycles(rng, count)
     if not ridden:
-        return _object_batch(bicycle, material, albedo, np.full(count, labels.BICYCLE), placements, first_instance)
+        return _object_batch(bicycle, material, albedo, np.full(count, classes.BICYCLE), placements, first_instance)
     rider, cloth, bright = _limbs(rng, _RIDER, rng.normal(1.75, 0.07, count), np.ones(count))
     rider[..., 2] += np.float32(0.06)
-    label = np.where(placements.speed_m_s != 0, labels.MOVING_BICYCLIST, labels.BICYCLIST)
+    label = np.where(placements.speed_m_s != 0, classes.MOVING_BICYCLIST, classes.BICYCLIST)
     pairs = ((bicycle, rider), (material, cloth), (albedo, bright))
     local, made_of, shade = (np.concatenate(pair, axis=1) for pair in pairs)
     return _object_batch(local, made_of, shade, label, placements, first_instance)

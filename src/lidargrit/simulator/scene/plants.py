@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Num
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.buildings import Houses
 from lidargrit.simulator.scene.shapes import MeshBuilder, leaves, owners, rows_of, tubes
@@ -52,14 +52,16 @@ def add_trees(
     near = away < _LIMBS_TO_M
     for some, sides in ((near, 7), (~near, 4)):
         stems = tubes((foot - np.array([0, 0, 0.3]))[some], top[some], trunk[some] * 1.15, trunk[some] * 0.75, sides)
-        builder.add(stems[:, : 2 * sides], materials.BARK, bark[some], labels.TRUNK)  # nobody sees the cap in the crown
+        builder.add(
+            stems[:, : 2 * sides], materials.BARK, bark[some], classes.TRUNK
+        )  # nobody sees the cap in the crown
     limb = np.repeat(np.flatnonzero(near), 4)
     way = rng.uniform(0, 2 * np.pi, len(limb))
     reach = wide[limb] * rng.uniform(0.4, 0.8, len(limb))
     rise = (tall - fork)[limb] * rng.uniform(0.3, 0.7, len(limb))
     tip = top[limb] + rows_of(reach * np.cos(way), reach * np.sin(way), rise)
     start = foot[limb] + (top - foot)[limb] * rng.uniform(0.75, 1.0, (len(limb), 1))
-    builder.add(tubes(start, tip, trunk[limb] * 0.5, 0.02, sides=4), materials.BARK, bark[limb], labels.VEGETATION)
+    builder.add(tubes(start, tip, trunk[limb] * 0.5, 0.02, sides=4), materials.BARK, bark[limb], classes.VEGETATION)
     middle = foot + np.column_stack((lean, (clear + tall) / 2))
     _add_crowns(builder, rng, middle, wide, (tall - clear) / 2, away, density=1.0)
 
@@ -112,7 +114,7 @@ def _add_crowns(
     within = _TUFT[rng.integers(0, len(_TUFT), len(home))]
     centre = tuft.reshape(-1, 3).astype(np.float32)[pick] + within * scale.astype(np.float32)[home]
     green = rng.uniform(0.3, 0.6, count)
-    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)
+    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], classes.VEGETATION)
 
 
 def add_hedges(
@@ -131,7 +133,7 @@ def add_hedges(
     high_u, high_v = u_m.max(axis=1) - 0.12, v_m.max(axis=1) - 0.12
     heart = plan.blocks(low_u, high_u, low_v, high_v, -0.3, rise_m + height_m - 0.12)
     green = rng.uniform(0.3, 0.6, len(u_m))
-    builder.add(heart, materials.LEAVES, green[:, None] * 0.8, labels.VEGETATION)
+    builder.add(heart, materials.LEAVES, green[:, None] * 0.8, classes.VEGETATION)
     size = rows_of(high_u - low_u, high_v - low_v, height_m) + np.array([0.24, 0.24, 0])
     middle = rows_of((low_u + high_u) / 2, (low_v + high_v) / 2, height_m / 2)
     leaf = np.minimum(0.9 * _leaf_m(plan.nearest_approach_m(plan.ground_points(middle[:, 0], middle[:, 1]))), 0.35)
@@ -158,4 +160,4 @@ def add_hedges(
     shares = np.stack(((1 - du) * (1 - dv), du * (1 - dv), (1 - du) * dv, du * dv), axis=1)
     centre = np.einsum("nk,nkc->nc", shares, corners[home])  # hedges are straight: no need to bend every leaf
     centre[:, 2] += at_m[:, 2] + rise_m
-    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], labels.VEGETATION)
+    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], classes.VEGETATION)

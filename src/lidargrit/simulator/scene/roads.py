@@ -4,13 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.shapes import MeshBuilder, quads
 from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
 
 _ROAD, _PAVEMENT, _PARKING, _YARD, _GREEN = range(5)
-_LABEL = np.array([labels.ROAD, labels.SIDEWALK, labels.PARKING, labels.OTHER_GROUND, labels.TERRAIN])
+_LABEL = np.array([classes.ROAD, classes.SIDEWALK, classes.PARKING, classes.OTHER_GROUND, classes.TERRAIN])
 _MATERIAL = np.array(
     [materials.ASPHALT, materials.CONCRETE, materials.ASPHALT, materials.CONCRETE, materials.GRASS], np.uint8
 )
@@ -114,7 +114,7 @@ def _add_kerbs(builder: MeshBuilder, base: np.ndarray, level: np.ndarray, axis: 
     start, end = base[i + 1, j], base[i + 1, j + 1]
     rise = np.zeros((len(i), 4, 3))
     rise[:, :2, 2], rise[:, 2:, 2] = low[i, j][:, None], high[i, j][:, None]
-    builder.add(quads(np.stack((start, end, end, start), axis=1) + rise), materials.CONCRETE, albedo, labels.SIDEWALK)
+    builder.add(quads(np.stack((start, end, end, start), axis=1) + rise), materials.CONCRETE, albedo, classes.SIDEWALK)
 
 
 def add_markings(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
@@ -145,7 +145,7 @@ def add_markings(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPla
     corners = plan.ground_points(bar[:, [0, 1, 1, 0]], bar[:, [2, 2, 3, 3]])
     corners[..., 2] += _PAINT_M
     bright = rng.uniform(0.5, 0.7) * rng.uniform(0.85, 1.0, (len(bar), 1))
-    builder.add(quads(corners), materials.ASPHALT, bright, labels.LANE_MARKING)
+    builder.add(quads(corners), materials.ASPHALT, bright, classes.LANE_MARKING)
 
 
 def _zebra(plan: StreetPlan, u_m: float) -> np.ndarray:
@@ -163,10 +163,10 @@ def add_bridge(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan)
     for side, wall in zip((-1, 1), walls, strict=True):
         v = side * np.linspace(abs(wall), 75.0, 8)
         bank = plan.blocks(u - half, u + half, v[:-1], v[1:], -0.5, top, flare_m=5.0)
-        builder.add(bank, materials.GRASS, rng.uniform(0.3, 0.5), labels.TERRAIN)
+        builder.add(bank, materials.GRASS, rng.uniform(0.3, 0.5), classes.TERRAIN)
         ends = plan.blocks(u - half - 0.2, u + half + 0.2, wall, wall + side * 0.8, -0.5, top)
-        builder.add(ends, materials.CONCRETE, concrete, labels.OTHER_STRUCTURE)
+        builder.add(ends, materials.CONCRETE, concrete, classes.OTHER_STRUCTURE)
     v = np.concatenate((np.linspace(-75, walls[0], 6), np.linspace(walls[1], 75, 6)))
     deck = plan.blocks(u - half, u + half, walls[0], walls[1], low, top)
     rails = [plan.blocks(u + way * half - 0.1, u + way * half + 0.1, v[:-1], v[1:], top, top + 0.9) for way in (-1, 1)]
-    builder.add(np.concatenate((deck, *rails)), materials.CONCRETE, concrete, labels.OTHER_STRUCTURE)
+    builder.add(np.concatenate((deck, *rails)), materials.CONCRETE, concrete, classes.OTHER_STRUCTURE)

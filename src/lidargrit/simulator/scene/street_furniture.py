@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Num
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.shapes import MeshBuilder, boxes, fans, owners, quads, rows_of, tubes
 from lidargrit.simulator.scene.street_plan import Poses, StreetPlan
@@ -21,7 +21,7 @@ def add_walls(
     """Add garden walls that fill boxes of the street."""
     solid = plan.blocks(u_m.min(axis=1), u_m.max(axis=1), v_m.min(axis=1), v_m.max(axis=1), -0.3, rise_m + height_m)
     stone = rng.choice([materials.CONCRETE, materials.BRICK, materials.PLASTER], len(u_m))
-    builder.add(solid, stone[:, None], rng.uniform(0.2, 0.5, (len(u_m), 1)), labels.FENCE)
+    builder.add(solid, stone[:, None], rng.uniform(0.2, 0.5, (len(u_m), 1)), classes.FENCE)
 
 
 def add_fences(
@@ -50,9 +50,9 @@ def add_fences(
     ]
     bright = rng.uniform(0.2, 0.5, len(length))
     made = rng.choice([materials.METAL, materials.BARK], len(length))
-    builder.add(posts, made[home][:, None], bright[home][:, None], labels.FENCE)
+    builder.add(posts, made[home][:, None], bright[home][:, None], classes.FENCE)
     for rail in rails:
-        builder.add(rail, made[:, None], bright[:, None], labels.FENCE)
+        builder.add(rail, made[:, None], bright[:, None], classes.FENCE)
 
 
 def _upright(
@@ -79,7 +79,7 @@ def add_guard_rails(builder: MeshBuilder, rng: np.random.Generator, plan: Street
     steel = rng.uniform(0.25, 0.45)
     rail = plan.blocks(along, along + 4.0, v - 0.04, v + 0.04, 0.45, 0.76)
     post = plan.blocks(along, along + 0.12, v + side * 0.05, v + side * 0.15, -0.2, 0.7)
-    builder.add(np.concatenate((rail, post)), materials.METAL, steel, labels.FENCE)
+    builder.add(np.concatenate((rail, post)), materials.METAL, steel, classes.FENCE)
 
 
 def add_lamps(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> None:
@@ -94,7 +94,7 @@ def add_lamps(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> N
     mast = tubes(foot, head, thick, thick * 0.6, sides=8)
     arm = tubes(head, rows_of(reach, 0.0, tall + 0.2), 0.04, 0.04, sides=4)
     lamp = boxes(rows_of(reach - 0.1, -0.15, tall + 0.1), rows_of(reach + 0.5, 0.15, tall + 0.25))
-    builder.add(poses.to_world(np.concatenate((mast, arm, lamp), axis=1)), materials.METAL, grey, labels.POLE)
+    builder.add(poses.to_world(np.concatenate((mast, arm, lamp), axis=1)), materials.METAL, grey, classes.POLE)
 
 
 def add_signs(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> None:
@@ -104,7 +104,7 @@ def add_signs(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> N
         return
     tall = rng.uniform(2.3, 3.1, count)
     pole = tubes(rows_of(0.0, 0.0, -0.3 * np.ones(count)), rows_of(0.0, 0.0, tall), 0.035, 0.035, sides=6)
-    builder.add(poses.to_world(pole), materials.METAL, rng.uniform(0.2, 0.4, (count, 1)), labels.POLE)
+    builder.add(poses.to_world(pole), materials.METAL, rng.uniform(0.2, 0.4, (count, 1)), classes.POLE)
     kind, radius = rng.integers(0, 4, count), rng.uniform(0.28, 0.42, count)
     corners = np.array([3, 4, 8, 8])[kind]  # a triangle, a square, an octagon, and a round one, nearly
     step = (np.arange(8) * corners[:, None] // 8) * (2 * np.pi / corners)[:, None]
@@ -115,7 +115,7 @@ def add_signs(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> N
         face = poses.to_world(fans(rim + np.array([x, 0, 0])))
         # Triangles and squares repeat corners of the eight: what has no area is left out.
         true = np.linalg.norm(np.cross(face[..., 1, :] - face[..., 0, :], face[..., 2, :] - face[..., 0, :]), axis=-1)
-        builder.add(face[true > 1e-4], material, bright, labels.TRAFFIC_SIGN)
+        builder.add(face[true > 1e-4], material, bright, classes.TRAFFIC_SIGN)
 
 
 def add_bins(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> None:
@@ -127,7 +127,7 @@ def add_bins(builder: MeshBuilder, rng: np.random.Generator, poses: Poses) -> No
     low = np.column_stack((-half, np.full(count, -0.2)))
     high = np.column_stack((half, rng.uniform(0.6, 1.3, count)))
     builder.add(
-        poses.to_world(boxes(low, high)), materials.PAINT, rng.uniform(0.05, 0.5, (count, 1)), labels.OTHER_OBJECT
+        poses.to_world(boxes(low, high)), materials.PAINT, rng.uniform(0.05, 0.5, (count, 1)), classes.OTHER_OBJECT
     )
 
 
@@ -143,4 +143,4 @@ def add_bollards(
         return
     foot = plan.ground_points(u_m, v_m)
     posts = tubes(foot, foot + np.array([0, 0, rng.uniform(0.8, 1.2)]), 0.06, 0.06, sides=6)
-    builder.add(posts, materials.METAL, rng.uniform(0.15, 0.5), labels.POLE)
+    builder.add(posts, materials.METAL, rng.uniform(0.15, 0.5), classes.POLE)

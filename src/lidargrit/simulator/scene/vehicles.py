@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from lidargrit.scans import labels
+from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import boxes, fans, loft, quads, rows_of, tubes
@@ -41,8 +41,8 @@ _WINDSCREEN, _REAR_SCREEN, _SIDE_PANES = 4, 10, (5, 6, 8, 9)
 _FAR_SECTIONS, _FAR_POINTS, _FAR_FACES = (0, 1, 4, 5, 8, 10, 11, 12, 13), (1, 2, 3, 4), (0, 2, 3, 5, 7, 8, 9, 11)
 _DETAIL_TO_M = 27.0  # beams lie 0.1 by 0.2 m apart there: wheels and seats are a pixel or two
 _AXLES = np.array([(0.19, 0.80)] * 4 + [(0.17, 0.78), (0.13, 0.76)])
-_LABELS = np.array([labels.CAR] * 5 + [labels.TRUCK])
-_MOVING = np.array([labels.MOVING_CAR] * 5 + [labels.MOVING_TRUCK])
+_LABELS = np.array([classes.CAR] * 5 + [classes.TRUCK])
+_MOVING = np.array([classes.MOVING_CAR] * 5 + [classes.MOVING_TRUCK])
 
 
 def sample_vehicle_kinds(rng: np.random.Generator, count: int, trucks: float = 0.03) -> Int[np.ndarray, " n"]:

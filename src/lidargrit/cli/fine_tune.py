@@ -1,0 +1,43 @@
+"""Train the networks of the package further on scans of your own; the same command goes on where it stopped."""
+
+import argparse
+from pathlib import Path
+
+from lidargrit.cli._options import add_settings
+
+EXAMPLES = """\
+  lidargrit fine-tune /data/scans runs/mine --sensor os1_64
+  lidargrit fine-tune kitti_odometry:/data/kitti:00 runs/kitti --dry-run     what would be done, and how long it takes
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.set_defaults(goes_on=True)
+    parser.add_argument("scans", help="scans: a folder, or NAME:ROOT:SPLIT; some of them are held out")
+    parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
+    parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the data set)")
+    add_settings(parser, "settings of the training to change, such as training.transformer.scans=2000")
+    parser.add_argument("--dry-run", action="store_true", help="print what would be done, and how long it takes")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Tell the time, then train."""
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.training import check_folder, computing_time, plan_training, train, training_flops
+    from lidargrit.training.fine_tuning import fine_tuning_preset
+
+    reporter = TerminalReporter()
+    reporter.message("looking at the scans")
+    preset = fine_tuning_preset(options.scans, reporter, options.sensor, options.set)
+    check_folder(options.out, preset)
+    flops = training_flops(preset)
+    said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in flops)
+    reporter.message(f"scans seen: {said}; stop it at any time, the same command goes on")
+    reporter.message(computing_time(sum(flops.values()), "fp32"))
+    if options.dry_run:
+        print(plan_training(preset).as_text())
+        return
+    train(preset, options.out, reporter)
+    print(f"done: lidargrit sample {options.out} samples -n 16, or --model {options.out} wherever a run is wanted")
+    print(f"bits before and after: lidargrit likelihood {preset.data.val[0]} --model pretrained, then {options.out}")

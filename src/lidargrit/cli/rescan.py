@@ -1,0 +1,46 @@
+"""Turn scans into those that another sensor, or another mounting, would have made of the same place."""
+
+import argparse
+from pathlib import Path
+
+from lidargrit.cli._options import add_bad_scans
+from lidargrit.core.errors import counted_scans
+
+EXAMPLES = """\
+  lidargrit rescan kitti_odometry:/data/kitti:00 sparse --to vlp16              64 rows to 16
+  lidargrit rescan /data/scans low --sensor os1_128 --to os1_64 --raised-m -0.5
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.set_defaults(goes_on=True)
+    parser.add_argument("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT or simulated:COUNT")
+    parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
+    parser.add_argument("--to", required=True, help="name or .json file of the sensor whose scans are wanted")
+    parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the source)")
+    raised = "height of the wanted sensor above the one that made the scans, in metres"
+    parser.add_argument("--raised-m", type=float, default=0.0, help=raised)
+    formats = "format of the files: bin, pcd, ply, las, npz, or kitti_odometry for a tree with labels"
+    parser.add_argument("--format", default="kitti_bin", help=formats)
+    parser.add_argument("-n", "--max-scans", type=int, default=0, help="number of scans, evenly spaced; 0 for all")
+    add_bad_scans(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Write the files, and say how many rays of the wanted sensor get a point."""
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.export import export_scans
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.data.sources import open_source
+    from lidargrit.scans.rescan import Rescan
+    from lidargrit.scans.sensors import load_sensor
+
+    reporter, other = TerminalReporter(), load_sensor(options.to)
+    source = open_source(options.scans, options.bad_points)
+    sensor = load_sensor(options.sensor) if options.sensor else source.sensor
+    change = Rescan(sensor, other, options.raised_m)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    count = export_scans(options.scans, options.out, options.format, config, reporter, change=change)
+    look = f"lidargrit view {options.out} --sensor {options.to}"
+    print(f"done: {counted_scans(count)} in {options.out}; look at them: {look}")

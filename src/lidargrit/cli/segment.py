@@ -1,0 +1,46 @@
+"""Label every point of scans with its class, by SemanticKITTI's numbers."""
+
+import argparse
+from pathlib import Path
+
+from lidargrit.cli._options import add_bad_scans, add_device
+from lidargrit.cli._results import add_json, print_result, refuse_taken
+from lidargrit.core.errors import counted_scans
+
+EXAMPLES = """\
+  lidargrit segment /data/scans labelled                 a KITTI tree with labels/NNNNNN.label
+  lidargrit view labelled -o labelled.html               look at it, coloured by class
+  lidargrit segment /data/scans labelled --model runs/mine
+  lidargrit segment simulated:16:val labelled --compare semantic_kitti       how well it finds their own labels
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Name the options."""
+    parser.set_defaults(goes_on=True)
+    add = parser.add_argument
+    add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
+    add("out", type=Path, help="folder for the tree: empty, or begun by the same command")
+    add("--model", default="pretrained", help="segmenter's run (default: pretrained)")
+    add("-n", "--max-scans", type=int, default=0, help="number of scans to take, evenly spaced; 0 for all")
+    compare = "also compare with the scans' own labels of this numbering: semantic_kitti, pandaset or nuscenes"
+    add("--compare", default="", metavar="NUMBERING", help=compare)
+    add_bad_scans(parser)
+    add_device(parser)
+    add_json(parser)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Label the scans, and say where they are."""
+    from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.inference.segment.command import segment_scans
+
+    refuse_taken(options)
+    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    named = (options.scans, options.out, options.model)
+    count, scores = segment_scans(*named, config, TerminalReporter(), options.device, options.compare)
+    found = scores.as_json() if scores else {}
+    done = f"done: {counted_scans(count, 'labelled')} in {options.out}; see them with: lidargrit view {options.out}"
+    result = {"source": options.scans, "model": options.model, "scans": count, **found}
+    print_result(options, scores.as_table() if scores else done, result, done if scores else "")

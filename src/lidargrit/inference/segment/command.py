@@ -1,0 +1,174 @@
+"""The verb segment: a source of scans, a segmenter and a folder → the scans with a label for every point."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from jaxtyping import Int
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.files import claim_folder
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.export import KittiTree, claimed_scans, write_with_labels
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import locate, weights_sha256
+from lidargrit.data.sources import open_source
+from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
+from lidargrit.inference.complete.inputs import ScanReader
+from lidargrit.inference.segment import can_label, label_images, open_segmenter
+from lidargrit.inference.segment.points import labels_of_points
+from lidargrit.inference.segment.scores import LabelScores
+from lidargrit.scans.classes import as_semantic_kitti
+from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
+from lidargrit.systems.segmenter.system import Segmenter
+
+MANIFEST = "segmented.json"
+_FEW_RINGS_CURE = (
+    "name a segmenter of the scans' sensor with --model, or train one: lidargrit train segmenter_compact RUN"
+)
+
+
+def segment_scans(
+    source: str,
+    out: Path,
+    model: str = "pretrained",
+    config: DataConfig | None = None,
+    reporter: Reporter | None = None,
+    device: str = "",
+    numbering: str = "",
+) -> tuple[int, LabelScores | None]:
+    """Write scans into a tree of KITTI odometry, with SemanticKITTI's ``labels/NNNNNN.label`` beside them.
+
+    Every point of a scan is there, in its order, with a label (:func:`~.points.labels_of_points`); of range images, a
+    point on the ray of each return. Files that are there already are not written again.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        out: an empty folder, or one that the same command began.
+        model: segmenter; see :func:`.open_segmenter`.
+        config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
+        reporter: receiver of progress and messages.
+        device: device to compute on.
+        numbering: numbering of the scans' own labels, with which the found ones are compared; "" for no comparison.
+
+    Returns:
+        number of scans that are there now, and how well their own labels were found, None without a comparison.
+
+    Raises:
+        ConfigError: a run that does not label scans, range images of other rows, or own labels of another numbering.
+        ScanError: a scan that cannot be used, or of another sensor.
+        DataError: no usable scan, or own labels are missing where they are to be compared.
+        OutputError: the folder holds something else, lies in the source, or cannot be written.
+    """
+    config, reporter = config or DataConfig(), reporter or Reporter()
+    segmenter = open_segmenter(model, device)
+    source_scans = _opened(source, segmenter, config)
+    source_scans.check_output(out)
+    scans = _LabelledScans(source_scans, segmenter, reporter)
+    files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
+    identities = {file: source_scans.identity(index) for index, file in enumerate(files)}
+    facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment")), "scans": identities}
+    missing = [index for index, file in enumerate(files) if not (out / file).exists()]
+    scores = LabelScores() if numbering else None
+    wanted, left_out = missing if scores is None else range(len(files)), set[int]()
+    if scores is not None:
+        _own_labels(scans.scan(0), numbering)  # a mistake is told before anything is written
+    with (
+        claim_folder(out),
+        claimed_scans(out / MANIFEST, facts) as files_left_out,
+        reporter.progress("labelling", len(files), len(files) - len(wanted)) as progress,
+    ):
+        for index, scan, label in scans.labelled(wanted, left_out if config.bad_scans == "skip" else None):
+            progress.advance(1)
+            if index in missing:
+                write_with_labels(out / files[index], replace(scan, label=label))
+            if scores is not None:
+                scores.add(label, _own_labels(scan, numbering))
+        files_left_out.update(files[index] for index in left_out)
+    if len(left_out) == len(files):
+        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+    return len(files) - len(left_out), scores
+
+
+def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans:
+    """Open the scans of a source; refuse range images that the segmenter cannot label."""
+    scans = named_scans(open_source(source, config.bad_points), config, segmenter.sensor)
+    if isinstance(scans, ImageScans) and not can_label(segmenter.sensor, scans.images.sensor):
+        of, own = scans.images.sensor, segmenter.sensor
+        raise ConfigError(
+            f"range images of {of.height}x{of.width} of the sensor {of.name!r} in {source}",
+            f"images of the segmenter's {own.height} rows of {own.name!r}, and a multiple of its {own.width} columns",
+            "name a segmenter of such images with --model, or give the scans as points",
+        )
+    return scans
+
+
+class _LabelledScans:
+    """The scans of a source, and the label that a segmenter finds for every point of them.
+
+    Args:
+        scans: scans of the source.
+        segmenter: segmenter of a run.
+        reporter: receiver of the first doubt about the sensor, and of the first number of points without a label.
+    """
+
+    def __init__(self, scans: NamedScans, segmenter: Segmenter, reporter: Reporter) -> None:
+        self._scans, self._segmenter, self._reporter = scans, segmenter, reporter
+        self._reader, self._told = (
+            ScanReader(segmenter.sensor.fine(), partial=True, few_rings_cure=_FEW_RINGS_CURE),
+            set[str](),
+        )
+
+    def scan(self, index: int) -> Scan:
+        """Return the points of a scan with the labels that it came with; of an image, a point for each return."""
+        return self._scans.scan(index)
+
+    def labelled(
+        self, indices: Iterable[int], skipped: set[int] | None
+    ) -> Iterator[tuple[int, Scan, Int[Tensor, " n"]]]:
+        """Yield each index with its scan and a label for every point.
+
+        Args:
+            indices: indices of scans.
+            skipped: set that gets the indices of unusable scans; None to refuse these.
+        """
+        for index in indices:
+            try:
+                scan = self.scan(index)
+                label = self._label(index, scan)
+            except ScanError as error:
+                if skipped is None:
+                    raise
+                self._reporter.message(f"left out: {error}")
+                skipped.add(index)
+            else:
+                yield index, scan, label
+
+    def _label(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
+        if isinstance(self._scans, ImageScans):
+            image = label_images(self._segmenter, RangeImage.stack([self._scans.image(index)]))
+            assert image.label is not None
+            return image.label[image.return_mask]
+        read = self._reader.read(scan)
+        assert read.point_of_pixel is not None
+        image = label_images(self._segmenter, RangeImage.stack([read.image]))[0]
+        label = labels_of_points(image, read.point_of_pixel, read.coordinates)
+        if read.doubt:
+            self._tell("doubt", f"WARNING: {read.doubt}")
+        if unlabelled := int((label == 0).sum()):
+            what = f"{unlabelled:,} of {len(scan):,} points have no return of the image nearby, and the label 0"
+            self._tell("unlabelled", f"{scan.source}: {what}; so may points of further scans")
+        return label
+
+    def _tell(self, kind: str, what: str) -> None:
+        if kind not in self._told:
+            self._told.add(kind)
+            self._reporter.message(what)
+
+
+def _own_labels(scan: Scan, numbering: str) -> Int[Tensor, " n"]:
+    """Return the labels that a scan came with, by SemanticKITTI's numbers."""
+    if scan.label is None:
+        raise DataError(f"no labels in {scan.source}", "labels to compare with", "leave --compare out")
+    return as_semantic_kitti(scan.label & CLASS_BITS, numbering)

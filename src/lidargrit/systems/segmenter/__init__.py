@@ -1,0 +1,1 @@
+"""The system ``segmenter``; see system.py."""

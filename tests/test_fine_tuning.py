@@ -1,0 +1,67 @@
+"""The networks of the package, trained further on a user's scans by one verb."""
+
+import json
+
+import pytest
+import torch
+
+import lidargrit
+from lidargrit.cli import main
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.reporting import Reporter
+from lidargrit.data.export import export_scans
+from lidargrit.training.fine_tuning import columns_like, fine_tuning_preset
+
+FEW = [
+    f"training.{stage}.{what}"
+    for stage in ("tokenizer", "transformer", "pixels")
+    for what in ("scans=2", "batch_size=1")
+]
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scans") / "mine"
+    export_scans("simulated:8:test", folder, "kitti_bin")
+    return folder
+
+
+def test_scans_seen_grow_with_the_scans_that_there_are_and_some_are_held_out(scans):
+    preset = fine_tuning_preset(str(scans), Reporter())
+    assert preset.training["transformer"].scans == 800
+    assert (preset.data.train, preset.data.val) == ((f"folder:{scans}:all[:85%]",), (f"folder:{scans}:all[85%:]",))
+    many = fine_tuning_preset("simulated:500:train", Reporter())
+    assert many.training["transformer"].scans == 8000
+    assert many.data.load_sensor().same_rays(lidargrit.load("pretrained").sensor)
+
+
+def test_images_of_another_sensor_of_64_rows_are_as_wide_as_the_models():
+    own = lidargrit.load("pretrained").sensor
+    assert columns_like(own, lidargrit.load_sensor("os1_64")) == (1024, 4)
+    assert columns_like(own, lidargrit.load_sensor("pandar64"))[0] % own.width == 0
+    with pytest.raises(ConfigError, match="scans of 16 rows"):
+        fine_tuning_preset("simulated:8:train", Reporter(), "vlp16")
+
+
+def test_the_verb_tells_the_time_trains_all_stages(scans, tmp_path, capsys):
+    out = tmp_path / "run"
+    words = ["fine-tune", str(scans), str(out), "--set", *FEW]
+    assert main([*words, "--dry-run"]) == 0
+    assert not out.exists()
+    said = capsys.readouterr()
+    assert "scans seen: tokenizer 2, transformer 2, pixels 2" in said.err
+    assert "on this machine's CPU" in said.err
+    assert main(words) == 0
+    before, after = lidargrit.load("pretrained"), lidargrit.load(str(out))
+    for stage in after.stages:
+        pairs = zip(
+            before.objective(stage).state_dict().values(), after.objective(stage).state_dict().values(), strict=True
+        )
+        assert any(not torch.equal(old, new) for old, new in pairs), f"{stage} was trained"
+    assert json.loads((out / "run.json").read_text())["preset"]["fine_tune"] == ["tokenizer", "transformer", "pixels"]
+
+
+def test_too_few_scans_are_refused_in_one_line(tmp_path, capsys):
+    export_scans("simulated:2:test", tmp_path / "two", "kitti_bin")
+    assert main(["fine-tune", str(tmp_path / "two"), str(tmp_path / "run")]) == 2
+    assert "at least 4, to hold one out" in capsys.readouterr().err

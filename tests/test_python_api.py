@@ -1,0 +1,112 @@
+"""``import lidargrit`` as people meet it: arrays of NumPy and tensors of torch go in, whole clouds come out."""
+
+import numpy as np
+import pytest
+import torch
+
+import lidargrit
+from lidargrit.core.errors import DataError, ScanError
+
+SENSOR = lidargrit.load_sensor("hdl64e_kitti_odometry")
+
+
+@pytest.fixture(scope="module")
+def scan():
+    return lidargrit.simulate(seed=0)
+
+
+@pytest.fixture(scope="module")
+def nearest():
+    return lidargrit.open_model("nearest", sensor=SENSOR.with_columns(512, 2))
+
+
+def test_dir_names_all_that_there_is():
+    assert set(dir(lidargrit)) == {*lidargrit.__all__, "__version__"}
+    for name in lidargrit.__all__:
+        assert getattr(lidargrit, name) is not None
+
+
+@pytest.mark.parametrize("convert", [np.float32, np.float64, torch.as_tensor], ids=["float32", "float64", "torch"])
+def test_points_of_any_kind_of_array_are_the_same_scan(scan, convert):
+    points = scan.points_xyz_m.numpy()
+    array = convert(points) if convert is torch.as_tensor else points.astype(convert)
+    found = lidargrit.scan_from_points(array)
+    assert torch.equal(found.points_xyz_m, scan.points_xyz_m)
+    image = lidargrit.project(scan, SENSOR)
+    assert torch.equal(lidargrit.project(array, "hdl64e_kitti_odometry").range_m, image.range_m)
+
+
+def test_intensity_ring_and_label_come_in_their_usual_scales_and_orders(scan):
+    points = scan.points_xyz_m.numpy().astype(np.float64)
+    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    from_below = np.searchsorted(np.sort(SENSOR.elevation_rad[:, 0].numpy()), elevation).clip(0, 63)
+    intensity = np.arange(len(points)) % 256
+    found = lidargrit.scan_from_points(np.column_stack((points, intensity)), ring=from_below, label=[7] * len(points))
+    assert found.reflectance is not None
+    np.testing.assert_allclose(found.reflectance.numpy(), intensity / 255, atol=1e-6)
+    assert found.ring is not None
+    np.testing.assert_array_equal(found.ring.numpy(), from_below.max() - from_below)
+    assert found.label is not None
+    assert found.label.unique().tolist() == [7]
+
+
+def test_complete_gives_every_point_back_bit_for_bit_and_marks_what_it_added(scan, nearest):
+    points = scan.points_xyz_m.numpy()
+    ahead = np.abs(np.arctan2(points[:, 1], points[:, 0])) < 0.3
+    points = points[~ahead]
+    whole = lidargrit.complete(points, nearest).whole()
+    assert whole.filled is not None
+    np.testing.assert_array_equal(whole.points_xyz_m[~whole.filled].numpy(), points)
+    x, y, _ = whole.points_xyz_m[whole.filled].numpy().T
+    assert (np.abs(np.arctan2(y, x)) < 0.3).sum() > 0.8 * ahead.sum()
+
+
+def test_upsample_gives_every_point_back_and_adds_rows(nearest):
+    few = lidargrit.simulate(seed=0, sensor=lidargrit.load_sensor("vlp16"))
+    whole = lidargrit.upsample(few.points_xyz_m, "vlp16", nearest).whole()
+    assert whole.filled is not None
+    assert torch.equal(whole.points_xyz_m[~whole.filled], few.points_xyz_m)
+    assert bool(whole.filled.any())
+
+
+def test_raydrop_tells_for_each_point_whether_it_stays_and_a_seed_repeats_it(scan):
+    points = scan.points_xyz_m.numpy()
+    done = lidargrit.raydrop(points, seed=3)
+    assert done.kept.shape == (len(points),)
+    assert 0.5 < float(done.kept.float().mean()) < 1
+    np.testing.assert_array_equal(done.whole().points_xyz_m.numpy(), points[done.kept.numpy()])
+    assert torch.equal(lidargrit.raydrop(points, seed=3).kept, done.kept)
+
+
+def test_scans_in_memory_score_as_the_same_scans_of_a_source():
+    streets = [[lidargrit.simulate(seed=seed).points_xyz_m.numpy() for seed in some] for some in ((0, 1), (2, 3))]
+    card = lidargrit.evaluate(*streets, metrics=["point_cloud_jsd"])
+    score = card.scores[0].result.value
+    same = lidargrit.evaluate(streets[0], streets[0], metrics=["point_cloud_jsd"]).scores[0].result.value
+    assert 0 <= same < score < 1
+    images = [torch.stack([lidargrit.project(each, SENSOR).range_m for each in some]) for some in streets]
+    assert images[0].shape == (2, 64, SENSOR.width)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ([[1.0, 2.0, 3.0]], "points as list"),
+        (np.ones((5, 2)), r"points of shape \(5, 2\)"),
+        (np.ones(3), r"points of shape \(3,\)"),
+        (np.array([["a", "b", "c"]]), "values of type"),
+        (np.array([[np.nan, 1.0, 1.0], [1.0, 1.0, 1.0]]), "1 of 2 points with NaN"),
+        (np.zeros((0, 3)), "no point"),
+    ],
+)
+def test_what_is_no_points_gets_one_line(points, message):
+    with pytest.raises(ScanError, match=message) as error:
+        lidargrit.complete(points)
+    assert "\n" not in str(error.value)
+
+
+def test_values_that_are_not_one_a_point_are_refused():
+    with pytest.raises(ScanError, match=r"ring of shape \(2,\)"):
+        lidargrit.scan_from_points(np.ones((3, 3)), ring=[1, 2])
+    with pytest.raises(DataError, match="no scan in memory"):
+        lidargrit.evaluate([], [np.ones((3, 3))])

@@ -1,0 +1,236 @@
+"""The segmenter: it learns and resumes, labels every point, and its labels are scored and coloured."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.core.errors import ConfigError
+from lidargrit.data.export import KittiTree
+from lidargrit.evaluation.metrics.shared.labelled import segmenter_of
+from lidargrit.inference.segment import can_label, label_images, open_segmenter
+from lidargrit.inference.segment.points import labels_of_points
+from lidargrit.inference.segment.scores import GROUPS, LabelScores
+from lidargrit.scans.classes import CLASSES
+from lidargrit.scans.example import Example
+from lidargrit.scans.projection import index_map, project
+from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.simulator import simulate
+from lidargrit.systems.segmenter.network import SegmenterNetworkConfig
+from lidargrit.systems.segmenter.objective import SegmenterObjective
+from lidargrit.systems.segmenter.system import Segmenter, SegmenterConfig
+from tiny_runs import learn, the_one_line
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
+TINY = SegmenterNetworkConfig((8, 8, 8), blocks=1, attention_layers=0, heads=1)
+TRAIN = [
+    "data.columns=64",
+    "data.train=simulated:4:train",
+    "data.val=simulated:1:val",
+    "model.segmenter.widths=[8,8,8]",
+    "model.segmenter.blocks=1",
+    "model.segmenter.attention_layers=0",
+    "training.segmenter.batch_size=2",
+    "training.segmenter.warmup_scans=4",
+    "training.segmenter.checkpoint_every=4",
+    "training.segmenter.validate_every=8",
+]
+
+
+def made(sensor=SENSOR, config=TINY):
+    torch.manual_seed(0)
+    return Segmenter(SegmenterConfig(config), sensor).eval()
+
+
+def scan_of(seed, columns=256):
+    return simulate(seed=seed, sensor=load_sensor("hdl64e_kitti_odometry").with_columns(columns))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Train a toy in two goes, and in one, and return both runs."""
+    root = tmp_path_factory.mktemp("segmenters")
+    for name, goes in (("whole", (12,)), ("resumed", (6, 12))):
+        for scans in goes:
+            words = ["train", "segmenter_compact", str(root / name), "--set", *TRAIN]
+            assert main([*words, f"training.segmenter.scans={scans}", "training.segmenter.schedule=constant"]) == 0
+            if scans == 6:  # as if it had been stopped there: more scans make another preset, which is another run
+                (root / name / "config.json").unlink()
+                about = json.loads((root / name / "run.json").read_text())
+                about["preset"]["training"]["segmenter"]["scans"] = 12
+                (root / name / "run.json").write_text(json.dumps(about))
+    return root
+
+
+def test_it_learns_the_classes_of_streets():
+    images = RangeImage.stack([project(scan_of(seed, 64), SENSOR) for seed in (1, 2)])
+    objective = SegmenterObjective(made().segmenter, SENSOR).train()
+    terms = learn(objective, images, range(60), 1e-2)
+    assert terms[-1]["accuracy"] > max(0.5, 2 * terms[0]["accuracy"])
+    assert terms[-1]["mean_iou"] > 2 * terms[0]["mean_iou"]
+    found = made()
+    found.load_stage("segmenter", objective)
+    label = found.segment(images).label
+    assert label is not None
+    learned = torch.tensor([[CLASSES[int(n)].learned for n in row] for row in images.label.flatten(1)]).view_as(label)
+    known = learned > 0
+    assert float((label == learned)[known].float().mean()) > 0.5
+    assert not label[~images.return_mask].any()
+
+
+def test_the_terms_are_those_of_a_loop():
+    images = RangeImage.stack([project(scan_of(3, 64), SENSOR)])
+    objective = SegmenterObjective(made(config=replace(TINY, reflectance=False)).segmenter, SENSOR).eval()
+    with torch.no_grad():
+        terms = objective(Example(images), torch.Generator())
+    log_p = objective.segmenter(images.range_m).log_softmax(1)[0].tolist()
+    order = sorted({each.learned for each in CLASSES.values()} - {0})
+    nats, right, found = [[] for _ in order], [0] * 19, [0] * 19
+    for row in range(64):
+        for column in range(64):
+            learned = CLASSES[int(images.label[0, row, column])].learned
+            if learned:
+                scores = [of_class[row][column] for of_class in log_p]
+                true, best = order.index(learned), scores.index(max(scores))
+                nats[true].append(-scores[true])
+                right[true] += true == best
+                found[best] += 1
+    weights = [len(each) ** 0.5 if each else 0 for each in nats]
+    mean = sum(w * sum(each) / len(each) for w, each in zip(weights, nats, strict=True) if each) / sum(weights)
+    assert float(terms["loss"]) == pytest.approx(mean, rel=1e-4)
+    assert float(terms["accuracy"]) == pytest.approx(sum(right) / sum(map(len, nats)))
+    iou = [right[at] / (len(nats[at]) + found[at] - right[at]) for at in range(19) if nats[at]]
+    assert float(terms["mean_iou"]) == pytest.approx(sum(iou) / len(iou), rel=1e-5)
+
+
+def test_a_resumed_training_gives_the_same_weights(run):
+    one, other = (open_segmenter(str(run / name), "cpu") for name in ("whole", "resumed"))
+    for name, weight in one.state_dict().items():
+        assert torch.equal(weight, other.state_dict()[name]), name
+
+
+def test_images_of_more_columns_are_labelled_column_by_column(run):
+    segmenter = open_segmenter(str(run / "whole"), "cpu")
+    wide = SENSOR.with_columns(256)
+    images = RangeImage.stack([project(scan_of(5), wide)])
+    label = label_images(segmenter, images).label
+    assert can_label(SENSOR, wide)
+    assert not can_label(SENSOR, SENSOR.with_columns(96))
+    assert not can_label(SENSOR, load_sensor("hdl64e_kitti_360").with_columns(64))
+    for first in range(4):
+        some = [each[..., first::4] for each in (images.range_m, images.return_mask, images.reflectance)]
+        alone = segmenter.segment(RangeImage(some[0], some[1], SENSOR, {"reflectance": some[2]}))
+        assert torch.equal(label[..., first::4], alone.label)
+
+
+def test_every_point_has_the_label_of_the_nearest_return_along_its_ray():
+    sensor, scan = SENSOR.with_columns(64), scan_of(7)
+    image = project(scan, sensor, "unfolding")
+    at = torch.from_numpy(index_map(scan, sensor, "unfolding").astype(np.int64))
+    image = image.with_planes(label=torch.where(image.return_mask, torch.arange(64 * 64).view(64, 64) % 81 + 1, 0))
+    pixels = pixel_coordinates(scan, sensor, "unfolding", "exact")
+    found = labels_of_points(image, at, pixels)
+    kept = {int(point) for point in at.flatten() if point >= 0}
+    assert len(kept) < len(scan) / 2
+    for point in [*sorted(kept)[::50], *range(0, len(scan), 97)]:
+        row, column = int(pixels.row[point]), int(pixels.column[point])
+        if point in kept:
+            assert int(found[point]) == int(image.label[row, column])
+            continue
+        for rows, columns in ((1, 2), (3, 8)):
+            near = [
+                (abs(float(image.range_m[r, c % 64]) - float(pixels.range_m[point])), int(image.label[r, c % 64]))
+                for r in range(max(row - rows, 0), min(row + rows, 63) + 1)
+                for c in range(column - columns, column + columns + 1)
+                if image.return_mask[r, c % 64]
+            ]
+            if near:
+                break
+        least = min(near)[0] if near else None
+        assert int(found[point]) in ({label for apart, label in near if apart == least} if near else {0})
+
+
+def test_the_verb_writes_a_label_for_every_point_and_goes_on(run, tmp_path, capsys):
+    for number in (0, 1):
+        KittiTree(tmp_path / "in").write(f"sequences/00/velodyne/{number:06d}.bin", scan_of(number))
+    words = ["segment", str(tmp_path / "in"), str(tmp_path / "out"), "--model", str(run / "whole"), "--device", "cpu"]
+    assert main([*words, "--compare", "semantic_kitti", "--json", str(tmp_path / "found.json")]) == 0
+    labels = sorted(tmp_path.glob("out/sequences/00/labels/*.label"))
+    assert [path.name for path in labels] == ["000000.label", "000001.label"]
+    scores = LabelScores()
+    for path in labels:
+        found, true = (
+            torch.from_numpy(np.fromfile(each, "<u4").astype(np.int64))
+            for each in (path, tmp_path / "in/sequences/00/labels" / path.name)
+        )
+        scores.add(found, true & 0xFFFF)
+    assert json.loads((tmp_path / "found.json").read_text())["mean"] == scores.mean()
+    before = labels[0].read_bytes()
+    labels[0].unlink()
+    (tmp_path / "out/sequences/00/velodyne/000000.bin").unlink()
+    assert main(words) == 0
+    assert labels[0].read_bytes() == before
+    page = tmp_path / "page.html"
+    assert main(["view", str(tmp_path / "out"), "-o", str(page), "--set", "data.columns=64"]) == 0
+    assert any(f'"{CLASSES[int(n)].name}"' in page.read_text() for n in np.unique(np.fromfile(labels[0], "<u4")) if n)
+
+
+def test_scores_are_those_of_a_loop():
+    rng = torch.Generator().manual_seed(0)
+    numbers = torch.tensor(sorted(CLASSES))
+    true, found = (numbers[torch.randint(len(numbers), (500,), generator=rng)] for _ in range(2))
+    scores, expected = LabelScores(), {}
+    scores.add(found[:200], true[:200])
+    scores.add(found[200:], true[200:])
+    pairs = [(CLASSES[int(t)].group, CLASSES[int(f)].group) for t, f in zip(true, found, strict=True)]
+    for group in GROUPS:
+        counted = [(t, f) for t, f in pairs if t]
+        both = sum(t == f == group for t, f in counted)
+        expected[group] = both / sum(group in pair for pair in counted)
+    assert scores.intersection_over_union() == pytest.approx(expected)
+    assert scores.mean() == pytest.approx(sum(expected.values()) / len(expected))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["simulated:1:test", "--model", "{run}/none"], "which does not exist; wanted a segmenter's run"),
+        (["simulated:1:test", "--model", "pretrained/raydrop"], "'raydrop', which labels no scans; wanted a segmenter"),
+        (
+            ["{tmp}/in", "--model", "{run}/whole", "--compare", "semantic_kitti"],
+            "does not have: 5, 41; wanted .*pand",
+        ),
+        (
+            ["{tmp}/bare.npz", "--model", "{run}/whole", "--compare", "pandaset"],
+            "no labels in .*; wanted labels to",
+        ),
+        (["{tmp}/in", "--model", "{run}/whole", "--compare", "waymo"], "numbering 'waymo'; wanted nuscenes, pandaset"),
+        (["{tmp}/image.npy", "--model", "{run}/whole"], "wanted .*"),
+        (["simulated:1:test", "--model", "{run}/whole", "--device", "abacus"], "abacus"),
+    ],
+)
+def test_what_cannot_be_labelled_is_told_in_one_line(words, told, run, tmp_path, capsys):
+    scan = scan_of(0)
+    foreign = torch.tensor([5, 41])[torch.arange(len(scan)) % 2]
+    KittiTree(tmp_path / "in").write("sequences/00/velodyne/000000.bin", replace(scan, label=foreign))
+    np.savez(tmp_path / "bare.npz", points=scan.points_xyz_m.numpy())
+    np.save(tmp_path / "image.npy", np.ones((32, 64), np.float32))
+    words = [word.format(run=run, tmp=tmp_path) for word in words]
+    assert main(["segment", words[0], str(tmp_path / "out"), *words[1:]]) != 0
+    assert re.search(told, the_one_line(capsys.readouterr().err, "segment"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_segmenter_has_no_scans_to_sample(run):
+    with pytest.raises(ConfigError, match=r"^got no condition for 'segmenter'; wanted a generator that samples"):
+        open_segmenter(str(run / "whole"), "cpu").sample([0])
+
+
+def test_a_named_run_labels_for_metrics(run):
+    assert segmenter_of(SENSOR.with_columns(128), run / "whole") == run / "whole"
