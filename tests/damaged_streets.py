@@ -74,9 +74,7 @@ def without_vehicles(images: RangeImage, share: float = 1.0) -> RangeImage:
                 if number * share % 1 < share:
                     for pixel in pixels:
                         gone[index][pixel] = True
-    return RangeImage.masked(
-        images.range_m, images.return_mask & ~gone, images.sensor, images.reflectance, images.label
-    )
+    return RangeImage.masked(images.range_m, images.return_mask & ~gone, images.sensor, images.planes)
 
 
 def boxes_for_vehicles(images: RangeImage) -> RangeImage:

@@ -61,3 +61,11 @@ def checked_planes(planes: Mapping[str, Tensor], shape: torch.Size) -> dict[str,
         if PLANES[name].dtype is np.int64 and (pixels.is_floating_point() or pixels.dtype == torch.bool):
             raise ConfigError(f"{name} of type {pixels.dtype}", "whole numbers", "make them of type torch.int32")
     return {name: pixels.float() if PLANES[name].dtype is np.float32 else pixels for name, pixels in planes.items()}
+
+
+def masked_planes(planes: Mapping[str, Tensor], return_mask: Tensor) -> dict[str, Tensor]:
+    """Return planes in which those of returns are 0 where nothing returned."""
+    return {
+        name: torch.where(return_mask, pixels, 0) if PLANES[name].of_returns else pixels
+        for name, pixels in planes.items()
+    }

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.file_rows import FileRows
-from lidargrit.scans.planes import NO_PLANES, PLANES, checked_planes, common_planes, planes_of
+from lidargrit.scans.planes import NO_PLANES, checked_planes, common_planes, masked_planes, planes_of
 from lidargrit.scans.sensors import SensorModel
 
 TYPICAL_LOG_RANGE = 2.5  # ln(1 + range in metres) in the middle of what scans hold: subtracted, inputs are near 0
@@ -168,11 +168,7 @@ class RangeImage:
         planes: Mapping[str, Shaped[Tensor, "*batch H W"]] = NO_PLANES,
     ) -> "RangeImage":
         """Make a range image of a clean range and a mask: planes of returns are set to 0 where nothing returned."""
-        kept = {
-            name: torch.where(return_mask, pixels, 0) if PLANES[name].of_returns else pixels
-            for name, pixels in planes.items()
-        }
-        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, kept)
+        return cls(torch.where(return_mask, range_m, 0.0), return_mask, sensor, masked_planes(planes, return_mask))
 
     @classmethod
     def stack(cls, images: "Sequence[RangeImage]") -> "RangeImage":
