@@ -83,7 +83,7 @@ def test_a_protocol_asks_for_what_there_is(name):
     for choice in protocol.metrics:
         assert choice.variant in load_metric(choice.metric).variants
     sensor = protocol.load_sensor()
-    assert (sensor is None) == (name == "exact")
+    assert (sensor is None) == (name in ("exact", "objects"))
     if sensor is not None:
         assert (sensor.height, sensor.width) == (64, 256 if name.endswith("odometry") else 1024)
         assert protocol.data_set in discovery.names("datasets")

@@ -68,7 +68,7 @@ def test_triangles_are_sound(meshes):
 
 def test_labels_materials_and_brightness_are_in_range(meshes):
     for mesh in meshes.values():
-        assert set(np.unique(mesh.label)) <= classes.LABELS
+        assert set(np.unique(mesh.label)) <= classes.CLASSES.keys()
         assert mesh.material.max() < len(materials.MATERIALS)
         assert mesh.albedo.min() > 0
         assert mesh.albedo.max() < 0.9

@@ -96,7 +96,7 @@ def test_every_point_has_its_own_pixel(name):
 def test_points_carry_label_and_instance(seen, sensor):
     scan, image = simulate(0, sensor.with_columns(1024)), seen[0]
     assert scan.label.dtype == torch.int64
-    assert set((scan.label & 0xFFFF).unique().tolist()) <= classes.LABELS
+    assert set((scan.label & 0xFFFF).unique().tolist()) <= classes.CLASSES.keys()
     for part, all_pixels in ((scan.label & 0xFFFF, image.label), (scan.label >> 16, image.instance)):
         assert sorted(part.tolist()) == sorted(all_pixels[image.return_mask].tolist())
     cars = (scan.label & 0xFFFF) == classes.CAR

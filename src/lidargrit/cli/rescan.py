@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_bad_scans
 from lidargrit.core.errors import counted_scans
+from lidargrit.core.untrusted import signed_number
 
 EXAMPLES = """\
   lidargrit rescan kitti_odometry:/data/kitti:00 sparse --to vlp16              64 rows to 16
@@ -20,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--to", required=True, help="name or .json file of the sensor whose scans are wanted")
     parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the source)")
     raised = "height of the wanted sensor above the one that made the scans, in metres"
-    parser.add_argument("--raised-m", type=float, default=0.0, help=raised)
+    parser.add_argument("--raised-m", type=signed_number, default=0.0, help=raised)
     formats = "format of the files: bin, pcd, ply, las, npz, or kitti_odometry for a tree with labels"
     parser.add_argument("--format", default="kitti_bin", help=formats)
     parser.add_argument("-n", "--max-scans", type=int, default=0, help="number of scans, evenly spaced; 0 for all")

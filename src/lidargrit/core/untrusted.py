@@ -174,6 +174,11 @@ def positive_number(word: str) -> float:
     return value
 
 
+def signed_number(word: str) -> float:
+    """Return a number of either sign; see :func:`positive_number`."""
+    return -positive_number(word[1:]) if word.startswith("-") else positive_number(word)
+
+
 _JSON_NAMES: dict[type, str] = {
     dict: "an object",
     list: "a list",

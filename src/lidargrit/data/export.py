@@ -31,7 +31,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
-from lidargrit.scans.rescan import Rescan, Rescanned
+from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
@@ -63,7 +63,7 @@ def export_scans(
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
-        change: what turns each scan into that of another sensor; scans stay as they are if not given.
+        change: view of another sensor, as which each scan is written; scans stay as they are if not given.
 
     Returns:
         Number of scans that are there now.
@@ -78,6 +78,7 @@ def export_scans(
     config, reporter = config or DataConfig(), reporter or Reporter()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
     scans, of_images = _open(source, config, sensor)
+    read = scans.scan if change is None else _View(scans, change, reporter)
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     check_names(source, files)
@@ -85,18 +86,11 @@ def export_scans(
     facts["scans"] = {file: scans.identity(index) for index, file in enumerate(files)}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
         told_labels, missing = layout.keeps_labels, _missing(out, files)
-        told, told_rays = _told_notes(source, scans.notes, set(), reporter), False
+        told = _told_notes(source, scans.notes, set(), reporter)
         with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
                 try:
-                    scan = scans.scan(index)
-                    if change is not None:
-                        seen = change(scan)
-                        told = _told_notes(
-                            change.other.name, [_told_rays(seen)] if not told_rays else [], told, reporter
-                        )
-                        told_rays, scan = True, seen.scan
-                    layout.write(files[index], scan)
+                    layout.write(files[index], scan := read(index))
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
@@ -106,15 +100,30 @@ def export_scans(
                     told_labels = told_labels or _told_labels(scan, files[index], reporter)
                     told = _told_notes(scan.source, scan.notes, told, reporter)
                 progress.advance(1)
-        if len(left_out) == len(files):
-            raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
-        return len(files) - len(left_out)
+        return _number_written(source, len(files), len(left_out))
 
 
-def _told_rays(seen: Rescanned) -> str:
-    """Return how many rays of another sensor get a point of the first scan."""
-    look = f"; {seen.without_rows:,} look where the scans have no rows" if seen.without_rows else ""
-    return f"{len(seen.scan):,} of {seen.rays:,} rays get a point of the first scan{look}"
+def _number_written(source: str, files: int, left_out: int) -> int:
+    if left_out == files:
+        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+    return files - left_out
+
+
+class _View:
+    """Scans as another sensor sees them; of the first one it tells how many rays get a point."""
+
+    def __init__(self, scans: NamedScans, change: Rescan, reporter: Reporter) -> None:
+        self._scans, self._change, self._reporter, self._told = scans, change, reporter, False
+
+    def __call__(self, index: int) -> Scan:
+        """Return one scan as the other sensor sees it."""
+        seen = self._change(self._scans.scan(index))
+        if not self._told:
+            look = f"; {seen.without_rows:,} look where the scans have no rows" if seen.without_rows else ""
+            points = f"{len(seen.scan):,} of {seen.rays:,} rays get a point of the first scan{look}"
+            self._reporter.message(f"{self._change.other.name}: {points}")
+            self._told = True
+        return seen.scan
 
 
 def _told_notes(of: str, notes: Sequence[str], told: set[str], reporter: Reporter) -> set[str]:

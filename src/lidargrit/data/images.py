@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Shaped
 
-from lidargrit.core.errors import DataError
+from lidargrit.core.errors import DataError, LidarGritError
 from lidargrit.scans.planes import PLANES
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -111,8 +112,8 @@ class RangeImages:
 
     @cached_property
     def _planes(self) -> frozenset[str]:
-        """Planes that the first image of every store has, and so all images must have that are read."""
-        return frozenset.intersection(*(frozenset(store.read(0).planes) for store in self._stores))
+        """Planes that the first usable image of every store has, and so all images must have that are read."""
+        return frozenset.intersection(*(_first_planes(store) for store in self._stores))
 
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
         """Return some images as one batch (B, H, W).
@@ -141,3 +142,11 @@ class RangeImages:
             raise DataError(got, "what the first image beside it has", "remove it, or make all of them alike")
         kept = slice(first_column, None, whole.range_m.shape[1] // self.sensor.width)
         return Pixels(whole.range_m[:, kept], {name: whole.planes[name][:, kept] for name in self._planes})
+
+
+def _first_planes(store: ImageStore) -> frozenset[str]:
+    """Return the planes of the first usable image of a store; others are told of when they are asked for."""
+    for index in range(len(store)):
+        with suppress(LidarGritError):
+            return frozenset(store.read(index).planes)
+    return frozenset()

@@ -104,8 +104,7 @@ def write_completions(
     Args:
         inputs: scans of the user.
         out: an empty folder, or one that the same command began.
-        task: the work on each scan.
-        output: number and kind of files.
+        task, output: work on each scan; number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
 
@@ -138,15 +137,20 @@ def write_completions(
                 else:
                     kept_labels, points = _write_cloud(out / file, sensor_file, output.format, task, job, images)
                     counts += points
-                if not kept_labels and not told_labels:
-                    told_labels = True
-                    reporter.message(labels_lost(file))
+                told_labels = told_labels or _told_labels(kept_labels, file, reporter)
                 progress.advance(1)
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
         raise DataError("no usable scan", "at least one", "see the messages above")
-    points = dict(zip(("points_in", "points_out", "points_filled"), counts.tolist(), strict=True))
-    return Written(len(files) - len(left_out) * output.count, sensor_file=sensor_file, **points)
+    points_in, points_out, points_filled = counts.tolist()
+    scans = len(files) - len(left_out) * output.count
+    return Written(scans, points_in, points_out, points_filled, sensor_file)
+
+
+def _told_labels(kept: bool, file: str, reporter: Reporter) -> bool:
+    if not kept:
+        reporter.message(labels_lost(file))
+    return not kept
 
 
 def _write_cloud(

@@ -73,6 +73,8 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
         file = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(file, dict):
             raise RefusedFileError("which holds no values by name")
+        if not isinstance(file["cfg"], dict):
+            raise RefusedFileError("whose settings have no names")
         settings = _Settings(file["cfg"])
         for name, required in _KNOWN_FORM.items():
             if name in settings and settings[name] != required:
