@@ -97,7 +97,7 @@ def export_scans(
                     reporter.message(f"left out: {error}")
                     left_out.add(files[index])
                 else:
-                    told_labels = told_labels or _told_labels(scan, files[index], reporter)
+                    told_labels = told_labels or tell_labels_lost(scan.label is not None, files[index], reporter)
                     told = _told_notes(scan.source, scan.notes, told, reporter)
                 progress.advance(1)
         return _number_written(source, len(files), len(left_out))
@@ -156,15 +156,11 @@ def check_names(source: str, names: Sequence[str]) -> None:
         raise DataError(got, "a name for each scan, as each becomes a file", "rename some, or take their folders apart")
 
 
-def labels_lost(file: str) -> str:
-    """Return the message that a file, by its ending, keeps no labels."""
-    return f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them"
-
-
-def _told_labels(scan: Scan, file: str, reporter: Reporter) -> bool:
-    if scan.label is not None:
-        reporter.message(labels_lost(file))
-    return scan.label is not None
+def tell_labels_lost(lost: bool, file: str, reporter: Reporter) -> bool:
+    """Tell, if labels are lost, that a file by its ending keeps none; return whether it was told."""
+    if lost:
+        reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
+    return lost
 
 
 def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:

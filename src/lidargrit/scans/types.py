@@ -214,14 +214,15 @@ class RangeImage:
         """Return the image with its pixels on another device."""
         return self.mapped(lambda pixels: pixels.to(device))
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> "RangeImage":
-        """Return the image in which range, mask and whatever else it has are changed alike."""
-        return replace(
-            self,
-            range_m=change(self.range_m),
-            return_mask=change(self.return_mask),
-            planes={name: change(pixels) for name, pixels in self.planes.items()},
-        )
+    def mapped(self, change: Callable[[Tensor], Tensor], sensor: SensorModel | None = None) -> "RangeImage":
+        """Return the image in which range, mask and whatever else it has are changed alike.
+
+        Args:
+            change: function of the pixels.
+            sensor: sensor of the changed pixels, where they are of another size.
+        """
+        planes = {name: change(pixels) for name, pixels in self.planes.items()}
+        return RangeImage(change(self.range_m), change(self.return_mask), sensor or self.sensor, planes)
 
 
 def sensor_of_all(sensors: Sequence[SensorModel]) -> SensorModel:

@@ -204,10 +204,9 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         logits, moved, scales = output.unflatten(1, (3, -1)).movedim(2, -1).unbind(1)
         middle = (self._low + self._high) / 2
         around = torch.stack([_shifted(log_range, *shift) for shift in _SHIFTS], -1)
+        around = around.repeat_interleave(self.config.cell_rows, 1).repeat_interleave(self.config.cell_columns, 2)
         absent = around.isnan()
         around = torch.cat((around.nan_to_num(middle), torch.full_like(around[..., :1], middle)), -1)
-        around = around.repeat_interleave(self.config.cell_rows, 1).repeat_interleave(self.config.cell_columns, 2)
-        absent = absent.repeat_interleave(self.config.cell_rows, 1).repeat_interleave(self.config.cell_columns, 2)
         reach = torch.cat((torch.full_like(moved[0, 0, 0, 1:], 0.3), torch.full_like(moved[0, 0, 0, :1], 3.0)))
         limits_m = (self.sensor.range_min_m, self.sensor.range_max_m)
         v = (around + reach * moved).clamp(self._low, self._high).exp().log1p()

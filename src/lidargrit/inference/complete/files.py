@@ -17,7 +17,7 @@ from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
 from lidargrit.core.files import claim_folder, write_json
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets.folder import SENSOR_FILE
-from lidargrit.data.export import IMAGE, TREE, KittiTree, check_names, claimed_scans, labels_lost, write_array
+from lidargrit.data.export import IMAGE, TREE, KittiTree, check_names, claimed_scans, tell_labels_lost, write_array
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.image_files import PROBABILITY
@@ -137,7 +137,7 @@ def write_completions(
                 else:
                     kept_labels, points = _write_cloud(out / file, sensor_file, output.format, task, job, images)
                     counts += points
-                told_labels = told_labels or _told_labels(kept_labels, file, reporter)
+                told_labels = told_labels or tell_labels_lost(not kept_labels, file, reporter)
                 progress.advance(1)
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
@@ -145,12 +145,6 @@ def write_completions(
     points_in, points_out, points_filled = counts.tolist()
     scans = len(files) - len(left_out) * output.count
     return Written(scans, points_in, points_out, points_filled, sensor_file)
-
-
-def _told_labels(kept: bool, file: str, reporter: Reporter) -> bool:
-    if not kept:
-        reporter.message(labels_lost(file))
-    return not kept
 
 
 def _write_cloud(

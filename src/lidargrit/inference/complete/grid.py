@@ -1,11 +1,9 @@
 """The rays of a whole cloud as images of a model: one for every column at which the model's columns may begin."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.scans.projection.sensor_check import known_rings
@@ -58,21 +56,16 @@ class RayGrid:
     def images(self, image: RangeImage) -> RangeImage:
         """Return one image (H, columns) of the grid as a batch of images of the model."""
         size = (self.model.height, self.model.width, self.phases)
-        return _of_other_size(image, self.model, lambda pixels: pixels.reshape(size).movedim(-1, 0).contiguous())
+        return image.mapped(lambda pixels: pixels.reshape(size).movedim(-1, 0).contiguous(), self.model)
 
     def joined(self, images: RangeImage) -> RangeImage:
         """Return a batch of images of the model, one for each phase, as one image of the grid."""
         size = (self.sensor.height, self.sensor.width)
-        return _of_other_size(images, self.sensor, lambda pixels: pixels.movedim(0, -1).reshape(size))
+        return images.mapped(lambda pixels: pixels.movedim(0, -1).reshape(size), self.sensor)
 
     def seeds(self, *parts: int) -> list[int]:
         """Return a seed for each image; that of the first is the seed of the model's image alone."""
         return [scan_seed(*parts, at) if at else scan_seed(*parts) for at in range(self.phases)]
-
-
-def _of_other_size(images: RangeImage, sensor: SensorModel, change: Callable[[Tensor], Tensor]) -> RangeImage:
-    planes = {name: change(pixels) for name, pixels in images.planes.items()}
-    return RangeImage(change(images.range_m), change(images.return_mask), sensor, planes)
 
 
 def phase_seed(seed: int, phase: int) -> int:

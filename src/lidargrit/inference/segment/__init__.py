@@ -1,6 +1,7 @@
 """A segmenter and range images → their labels, also where the images have more columns than the segmenter's sensor."""
 
 import math
+from operator import itemgetter
 
 import torch
 
@@ -62,13 +63,9 @@ def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
     steps = images.sensor.width // segmenter.sensor.width
     label = torch.zeros(images.range_m.shape, dtype=torch.int64)
     for first in range(steps):
-        some = RangeImage(
-            images.range_m[..., first::steps],
-            images.return_mask[..., first::steps],
-            segmenter.sensor,
-            {name: pixels[..., first::steps] for name, pixels in images.planes.items()},
-        )
+        part = (..., slice(first, None, steps))
+        some = images.mapped(itemgetter(part), segmenter.sensor)
         found = segmenter.segment(some).label
         assert found is not None
-        label[..., first::steps] = found.cpu()
+        label[part] = found.cpu()
     return images.to("cpu").with_planes(label=label)
