@@ -1,0 +1,1 @@
+"""The system ``pyramid``; see system.py."""

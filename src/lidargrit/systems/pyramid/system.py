@@ -1,0 +1,235 @@
+"""Nearest ranges from coarse to fine: seeds → range images, each level given the one of half its size."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.generation.batches import BatchSeeds
+from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.objective import Objective
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling, nats_to_range_bits
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.nn.random import rngs_of
+from lidargrit.scans.condition import Condition
+from lidargrit.scans.example import Example
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import Decoded, RangeImage, ScanBits
+from lidargrit.systems.pyramid.network import Level, ParentNetwork, halved_sensor, nearest_of_four
+
+_ROW_HALVINGS = 2  # of a level's phases: then pixels above one another know of one another, as those of a pole have to
+_LEVELS_AT_MOST = 16
+_FINE_LEVELS = 2  # which learn from a part of each batch, since they have as many pixels as all others together
+
+
+@dataclass(frozen=True)
+class PyramidConfig:
+    """The levels and their networks.
+
+    Args:
+        levels: number of images, each of half as many rows and columns as the one before.
+        pixels: sizes of the pixel decoder of the finest level, the scan itself.
+        coarse_range_width: number of channels of the range networks of all coarser levels.
+        top_range_width: number of channels of that of the coarsest level, which is given nothing.
+        parent_width: number of channels of the network that each level but the coarsest has over the coarser one.
+        parent_blocks: number of its residual blocks.
+        finest_parent_width: number of channels of that network for the scan itself.
+    """
+
+    levels: int = 6
+    pixels: PixelDecoderConfig = field(default_factory=PixelDecoderConfig)
+    coarse_range_width: int = 48
+    top_range_width: int = 64
+    parent_width: int = 48
+    parent_blocks: int = 4
+    finest_parent_width: int = 32
+
+    def __post_init__(self) -> None:
+        if not 2 <= self.levels <= _LEVELS_AT_MOST:
+            raise ConfigError(f"levels={self.levels}", f"2 to {_LEVELS_AT_MOST}", "correct it")
+        for name in ("coarse_range_width", "top_range_width", "parent_width", "parent_blocks", "finest_parent_width"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+
+
+class Pyramid(Generator[PyramidConfig, PixelSampling]):
+    """Range images of nearest ranges, from coarse to fine: first what is near, then what stands behind it.
+
+    A pixel of a coarser level has the nearest range of 2x2 pixels of the finer one. So what is thin and near, such as
+    a pole, stands at every level, and a finer level only decides which of four pixels it fills, where a mean or every
+    second pixel would lose it. Each level is a pixel decoder given the coarser level.
+
+    Source:
+        Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017, for levels and phases; there each
+        level keeps every second pixel.
+    """
+
+    Config = PyramidConfig
+    facts = SystemFacts(generates="range and raydrop, nearest ranges first, from coarse to fine")
+    Sampling = PixelSampling
+    capabilities = frozenset({"likelihood"})
+
+    def __init__(self, config: PyramidConfig, sensor: SensorModel) -> None:
+        super().__init__(config, sensor)
+        least = 2**config.levels
+        if sensor.height % least or sensor.width % least:
+            raise ConfigError(
+                f"range images of {sensor.height}x{sensor.width} for {config.levels} levels",
+                f"rows and columns divisible by {least}",
+                "lower levels, or choose another number of columns",
+            )
+        sensors = [sensor]
+        for _ in range(config.levels - 1):
+            sensors.append(halved_sensor(sensors[-1]))
+        self.levels = nn.ModuleList(_level(config, number, sensors) for number in range(config.levels))
+
+    @classmethod
+    def smallest_config(cls, sensor: SensorModel) -> PyramidConfig:
+        """Return three levels of eight channels and one block."""
+        pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=8, range_width=8, blocks=1)
+        return PyramidConfig(3, pixels, 8, 8, 8, 1, 8)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """All levels at once."""
+        return ("levels",)
+
+    def objective(self, stage: str) -> Objective:
+        """Return the negative log-likelihood of all levels."""
+        return PyramidObjective(self.levels, self.sensor) if stage == "levels" else super().objective(stage)
+
+    def load_stage(self, stage: str, objective: Objective) -> None:
+        """Take over the trained weights."""
+        self.levels.load_state_dict(objective.get_submodule(stage).state_dict())
+
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
+        rngs, images, told = rngs_of(seeds), None, None
+        for level in reversed(levels_of(self.levels)):
+            images, told = level.sample(images, told, rngs, sampling if level.sensor is self.sensor else None)
+        assert images is not None
+        return images
+
+    def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
+        """Return the bits of mask and ranges given the coarser level, and those of all coarser levels as tokens."""
+        levels = levels_of(self.levels)
+        pyramid = images_of(levels, images)
+        guides = guides_of(levels, pyramid)
+        coarser: Float[Tensor, "B h w"] | None = None
+        for level, image, guide in zip(levels[1:], pyramid[1:], guides[1:], strict=True):
+            mask, range_, _ = level.pixels.bits(guide, image, steps, False)
+            bits = mask + range_
+            # all bits of a cell of the coarsest level stand there together
+            while bits.shape[-1] > levels[-1].sensor.width:
+                bits = 4 * F.avg_pool2d(bits[:, None], 2)[:, 0]
+            coarser = bits if coarser is None else coarser + bits
+        assert coarser is not None
+        finest = levels[0].pixels.bits(guides[0], images, steps, expected)
+        return ScanBits(steps.step_mm, images.return_mask, coarser, *finest)
+
+    def cost(self, sampling: PixelSampling | None = None) -> Cost:
+        """Return the cost of all phases of all levels."""
+        levels = levels_of(self.levels)
+        evaluations = sum(level.pixels.num_evaluations + (level.parent is not None) for level in levels)
+        return Cost(evaluations, sum(level.flops() for level in levels))
+
+
+class PyramidObjective(Objective):
+    """Negative log-likelihood of every level, each given the true coarser level.
+
+    The levels share no weights, so each learns as if it were alone. In training the two finest learn from an eighth and
+    a quarter of each batch: coarser ones have fewer pixels to learn from.
+
+    Args:
+        levels: the levels, the finest first.
+        sensor: sensor of the scans.
+    """
+
+    reaches_all_weights = False  # some phases stand for all
+
+    def __init__(self, levels: nn.ModuleList, sensor: SensorModel) -> None:
+        super().__init__(sensor)
+        self.levels = levels
+
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the sum over all levels of nats of the mask a pixel, and of the range a pixel, as ``loss``.
+
+        Beside it are the bits of the finest level, given the coarser one: a pixel's mask and a return's range.
+        """
+        levels = levels_of(self.levels)
+        pyramid = images_of(levels, example.images)
+        if self.training:
+            pyramid = [images[: _learned_from(len(images), number)] for number, images in enumerate(pyramid)]
+        loss = example.images.range_m.new_zeros(())
+        terms: dict[str, Tensor] = {}
+        for level, images, guide in zip(levels, pyramid, guides_of(levels, pyramid), strict=True):
+            returned = images.return_mask.float().mean()
+            if self.training:
+                mask_nats, range_nats = level.pixels.estimate(guide, images, rng)
+            else:
+                nll = level.pixels(guide, images)
+                mask_nats = nll.mask.mean()
+                range_nats = nll.range.sum() / images.return_mask.sum().clamp(min=1)
+            loss = loss + mask_nats + returned * range_nats
+            bits = mask_nats / math.log(2), nats_to_range_bits(range_nats)
+            rows = f"_{level.sensor.height}" if terms else ""  # the finest level has the plain names
+            names = f"mask_bits{rows}", f"range_bits{rows}"
+            terms |= {name: value.detach() for name, value in zip(names, bits, strict=True)}
+        return {"loss": loss, **terms}
+
+
+def levels_of(modules: nn.ModuleList) -> list[Level]:
+    """Return the levels, the finest first."""
+    return [level for level in modules if isinstance(level, Level)]
+
+
+def images_of(levels: list[Level], images: RangeImage) -> list[RangeImage]:
+    """Return the range images of all levels, those of the scans first."""
+    found = [images]
+    for level in levels[1:]:
+        found.append(nearest_of_four(found[-1], level.sensor))
+    return found
+
+
+def guides_of(levels: list[Level], pyramid: list[RangeImage]) -> list[Decoded | None]:
+    """Return what each level is told by the images of all coarser ones, the finest first.
+
+    Args:
+        pyramid: images of all levels, the finest first; a finer level may have fewer of them, the first ones.
+    """
+    guides: list[Decoded | None] = []
+    told: Float[Tensor, "B D h w"] | None = None
+    for level, images, coarser in zip(reversed(levels), reversed(pyramid), [None, *reversed(pyramid[1:])], strict=True):
+        count = len(images)
+        guide, told = level.guided(None if coarser is None else coarser[:count], None if told is None else told[:count])
+        guides.append(guide)
+    return guides[::-1]
+
+
+def _learned_from(scans: int, number: int) -> int:
+    """Return of how many scans of a batch a level learns."""
+    return scans if number >= _FINE_LEVELS else max(1, scans * 2**number // 8)
+
+
+def _level(config: PyramidConfig, number: int, sensors: list[SensorModel]) -> Level:
+    sensor, finest = sensors[number], config.pixels
+    coarse = replace(finest, surface_components=False, gravity_components=False, range_width=config.coarse_range_width)
+    if number == len(sensors) - 1:
+        rows, columns = (size & -size for size in (sensor.height, sensor.width))  # the largest powers of 2 in them
+        halvings = {"column_halvings": 0, "row_halvings": 0}
+        if rows != columns:
+            side = "column_halvings" if columns > rows else "row_halvings"
+            halvings[side] = (max(rows, columns) // min(rows, columns)).bit_length() - 1
+        top = replace(coarse, range_width=config.top_range_width, decoded_components=False, **halvings)
+        return Level(sensor, replace(top, coarsest_cell=min(rows, columns)), None)
+    halvings = min(_ROW_HALVINGS, ((sensor.height & -sensor.height) // 2).bit_length() - 1)
+    decoder = replace(coarse if number else finest, coarsest_cell=2, column_halvings=0, row_halvings=halvings)
+    width = config.parent_width if number else config.finest_parent_width
+    coarser = 0 if number == len(sensors) - 2 else config.parent_width
+    parent = ParentNetwork(sensor.height // 2, width, config.parent_blocks, decoder.range_features, coarser)
+    return Level(sensor, decoder, parent)
