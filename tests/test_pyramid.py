@@ -76,7 +76,8 @@ def test_suggested_ranges_are_those_of_the_cell_the_ground_and_the_cells_next_to
         above = at(cell[0] + over, cell[1]) or own
         across = at(cell[0] + over, cell[1] + side) or own
         here, lower = (-math.sin(float(SENSOR.elevation_rad[index])) for index in (row, 2 * cell[0] + 1))
-        ground = min(own * max(lower, 1e-3) / max(here, 1e-3), SENSOR.range_max_m)
+        farther = lower / here if here > 0 else 1.0
+        ground = own * farther if farther < 3 else own
         expected = torch.tensor([own, ground, beside, above, across])
         torch.testing.assert_close(found[:, row, column], expected, rtol=1e-4, atol=1e-4)
 

@@ -15,8 +15,10 @@ from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.evaluation.differences import compare_systems
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score, around
+from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.scorecard import EvalSetRecord, LeftOut, Scorecard
 from lidargrit.evaluation.tables import judge, share_pixel_statistics, side_by_side
+from lidargrit.evaluation import sight
 from lidargrit.evaluation.verdict import ENOUGH, notes_on_floors, tells_apart, verdict
 from lidargrit.publishing.card import _scores
 from lidargrit.scans.types import MetricResult
@@ -41,6 +43,58 @@ def card(*scores, facts=FACTS, **more):
 
 def said(*scores, **more):
     return verdict(scores, 200, **more).sentences
+
+
+@pytest.fixture(autouse=True)
+def every_metric_sees_objects(monkeypatch):
+    monkeypatch.setattr(sight, "blind_to", lambda metric, variant, scans: () if metric != "coverage" else ("boxes",))
+
+
+def test_a_metric_that_would_not_have_seen_damaged_objects_is_not_within_noise():
+    real, note = said(score(0.15, 0.1, 0.9), score(0.1, 0.1, 0.9, metric="coverage"))[1:]
+    assert real == (
+        "Against real scans: worse in 0 of 2 scores, within noise in 1 (bev_jsd), undecided in 1 (coverage)."
+    )
+    assert note == (
+        "coverage would not have seen blurred ranges, missing vehicles or boxes in their place, at least one of them, "
+        "with 200 scans: no good score there is called within noise."
+    )
+    convicted = said(score(0.85, 0.1, 0.9, metric="coverage"))
+    assert convicted[1].startswith("Against real scans: worse in 1 of 1 scores")
+    assert not any("would not have seen" in sentence for sentence in convicted)
+
+
+def test_a_damage_that_was_seen_with_fewer_scans_is_seen_with_more(monkeypatch):
+    rows = [
+        {"metric": "m", "variant": "v", "damage": damage, "scans": scans, "deviations": deviations}
+        for damage, scans, deviations in [
+            ("blur", "300", "9.0"),
+            ("blur", "100", "2.0"),
+            ("boxes", "100", "3.1"),
+            ("boxes", "300", "1.0"),
+            ("gone", "100", "0.1"),
+            ("gone", "300", "2.8"),
+        ]
+    ]
+    monkeypatch.undo()
+    monkeypatch.setattr(sight, "_rows", lambda: iter(rows))
+    sight._measured.cache_clear()
+    assert sight.blind_to("m", "v", 299) == ("boxes", "blur", "gone")[1:]
+    assert sight.blind_to("m", "v", 300) == ("gone",)
+    assert sight.blind_to("m", "v", 99) == ("blur", "boxes", "gone")
+    assert sight.blind_to("m", "other", 300) is None
+    monkeypatch.undo()
+    sight._measured.cache_clear()
+
+
+def test_every_measured_metric_has_every_damage_and_is_one_of_the_program():
+    measured = sight._measured()
+    damages = {tuple(sorted(each)) for each in measured.values()}
+    assert len(damages) == 1
+    assert len(damages.pop()) == 3
+    for metric, variant in measured:
+        assert variant in load_metric(metric).variants
+    assert sum(sight.blind_to(*column, 300) == () for column in measured) > 0
 
 
 def test_all_scores_are_counted_and_losses_come_first():

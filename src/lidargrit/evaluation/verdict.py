@@ -11,7 +11,8 @@ Every score table of this program knows three bounds, by these names alone:
 Metrics of what stands in scans are named first, and the number of objects a scan stands before all counts.
 
 A score counts as lost wherever its metric sees a difference. It counts as won only where the metric tells pixel
-statistics from real scans: of one that does not, a good score says little.
+statistics from real scans: of one that does not, a good score says little. It is called within noise only where the
+metric would have seen known damages of objects, with as many scans (:func:`.blind_to`).
 """
 
 from collections.abc import Container, Mapping, Sequence
@@ -19,6 +20,7 @@ from dataclasses import dataclass
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import counted_scans
+from lidargrit.evaluation import sight
 from lidargrit.evaluation.intervals import Score, format_value
 from lidargrit.evaluation.metrics import load_metric
 
@@ -113,13 +115,19 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
     tallies = []
     if known_pixels := any(stands is not None for stands in by_pixels.values()):
         tallies.append(_tally("Against pixel statistics", by_pixels, (-1,), seeing, names))
+    sharp = {column for column in seeing if sight.blind_to(*column, scans) == ()}
     if any(stands is not None for stands in by_real.values()):
-        tallies.append(_tally("Against real scans", by_real, (0, -1), seeing, names, "within noise"))
+        tallies.append(_tally("Against real scans", by_real, (0, -1), sharp, names, "within noise"))
     if not tallies:
         return Verdict((), (_NOTHING_KNOWN, *said), objects)
     notes = [] if known_pixels else [_WITHOUT_PIXELS]
     if blind := [names[column_of(score)] for score in scores if tells_apart(score) is False]:
         notes.append(f"Pixel statistics pass for real scans in {', '.join(blind)}: no good score there is counted.")
+    if dull := [names[each] for each, stands in by_real.items() if stands in (0, -1) and each in seeing - sharp]:
+        notes.append(
+            f"{', '.join(dull)} would not have seen blurred ranges, missing vehicles or boxes in their place, at least "
+            f"one of them, with {counted_scans(scans)}: no good score there is called within noise."
+        )
     if left_out:
         notes.append(f"Not scored, so undecided: {', '.join(map(names.__getitem__, left_out))}.")
     if beyond := [names[each] for each, stands in by_real.items() if stands == -1 and each in seeing]:

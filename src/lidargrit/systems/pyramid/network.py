@@ -18,7 +18,7 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded, RangeImage
 
 _HEAD_STARTS = (0.0, -1.0, -2.0, -2.0, -3.0)  # logits of the suggested ranges: mostly a pixel has that of its cell
 _LOG_SCALE_M = -3.0  # 5 cm
-_LEAST_SINE = 1e-3  # of the angle below the horizon: rays above it meet no ground
+_FARTHER_AT_MOST = 3.0  # from row to row of level ground; beyond, the ground is too far away to be seen
 _OWN_DISTRIBUTION = PixelSampling(range_temperature=1.0, range_noise=1.0, mask_correlation=0.0)
 
 
@@ -136,9 +136,10 @@ class Level(nn.Module):
         tall = _rows_doubled(wide)
         above = torch.where(over(wide_mask), over(wide), tall)
         across = torch.where(over(there), over(beside), tall)
-        down = (-self.sensor.elevation_rad.to(own)).sin().clamp(min=_LEAST_SINE)
+        down = (-self.sensor.elevation_rad.to(own)).sin()
         lower = _rows_doubled(down[None, 1::2])[0]
-        ground = (tall * lower / down).clamp(max=self.sensor.range_max_m)
+        farther = torch.where(down > 0, lower / down, 1.0)  # the upper row of level ground; 1 above the horizon
+        ground = torch.where(farther < _FARTHER_AT_MOST, tall * farther, tall)
         return torch.stack((tall, ground, _rows_doubled(beside), above, across), 1)
 
     def sample(

@@ -25,7 +25,7 @@ from lidargrit.systems.pyramid.network import Level, ParentNetwork, halved_senso
 
 _ROW_HALVINGS = 2  # of a level's phases: then pixels above one another know of one another, as those of a pole have to
 _LEVELS_AT_MOST = 16
-_FINE_LEVELS = 2  # which learn from a part of each batch, since they have as many pixels as all others together
+_SHARES = (1 / 16, 1 / 8, 1 / 2)  # of a batch, from which the finest levels learn: they have the most pixels in a scan
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
 class PyramidObjective(Objective):
     """Negative log-likelihood of every level, each given the true coarser level.
 
-    The levels share no weights, so each learns as if it were alone. In training the two finest learn from an eighth and
-    a quarter of each batch: coarser ones have fewer pixels to learn from.
+    In training the three finest levels learn from a sixteenth, an eighth and half of each batch: coarser ones have fewer
+    pixels to learn from.
 
     Args:
         levels: the levels, the finest first.
@@ -213,7 +213,7 @@ def guides_of(levels: list[Level], pyramid: list[RangeImage]) -> list[Decoded | 
 
 def _learned_from(scans: int, number: int) -> int:
     """Return of how many scans of a batch a level learns."""
-    return scans if number >= _FINE_LEVELS else max(1, scans * 2**number // 8)
+    return scans if number >= len(_SHARES) else max(1, round(scans * _SHARES[number]))
 
 
 def _level(config: PyramidConfig, number: int, sensors: list[SensorModel]) -> Level:
