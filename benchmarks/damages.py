@@ -110,7 +110,9 @@ def _streets(folder: Path, block: int) -> RangeImage:
         images = [project(simulate(seed, SENSOR), SENSOR) for seed in range(first, first + _BLOCK)]
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as partial, partial.open("wb") as file:
-            np.savez(file, range_m=torch.stack([i.range_m for i in images]), label=torch.stack([i.label for i in images]))
+            np.savez(
+                file, range_m=torch.stack([i.range_m for i in images]), label=torch.stack([i.label for i in images])
+            )
     kept = {name: torch.from_numpy(values) for name, values in np.load(path).items()}
     return RangeImage.masked(kept["range_m"], kept["range_m"] > 0, SENSOR, {"label": kept["label"]})
 

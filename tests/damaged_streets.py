@@ -14,7 +14,7 @@ from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-from damages import blurred, boxes_for_vehicles, without_vehicles  # noqa: E402, F401 — for the tests of metrics
+from damages import blurred, boxes_for_vehicles, without_vehicles  # noqa: F401 — for the tests of metrics
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
 KINDS = {10: 0, 18: 0, 20: 0, 30: 1, 31: 1, 32: 1, 80: 2, 71: 3}  # by the benchmark's number

@@ -67,7 +67,7 @@ class ParentNetwork(Network):
 
         Args:
             maps: mask and encoded range of the image of half the size.
-            coarser: what the network of the next coarser level tells, of half the size again.
+            coarser: output of the network of the next coarser level for finer ones, of half the size again.
         """
         if coarser is not None:
             maps = torch.cat((maps, F.interpolate(coarser, scale_factor=2.0, mode="nearest")), 1)
@@ -97,7 +97,7 @@ class Level(nn.Module):
 
         Args:
             coarser: range images of half the size.
-            told: what the next coarser level told.
+            told: output of the next coarser level for finer ones.
         """
         if self.parent is None or coarser is None:
             return None, None
@@ -111,9 +111,7 @@ class Level(nn.Module):
         centres = suggested_m.log1p()
         starts = centres.new_tensor(_HEAD_STARTS)[:, None, None].expand_as(centres)
         components = torch.stack((starts, centres, _LOG_SCALE_M - centres), 1)
-        return Decoded(
-            suggested_m[:, 0], logits, self.sensor, features=output[:, :-1], components=components
-        ), tell
+        return Decoded(suggested_m[:, 0], logits, self.sensor, features=output[:, :-1], components=components), tell
 
     def suggested_m(self, coarser: RangeImage) -> Float[Tensor, "B K H W"]:
         """Return ranges in metres that a pixel may have, by the coarser level.

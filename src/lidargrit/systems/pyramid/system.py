@@ -142,8 +142,8 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
 class PyramidObjective(Objective):
     """Negative log-likelihood of every level, each given the true coarser level.
 
-    In training the three finest levels learn from a sixteenth, an eighth and half of each batch: coarser ones have fewer
-    pixels to learn from.
+    In training the three finest levels learn from a sixteenth, an eighth and half of each batch: coarser ones have
+    fewer pixels to learn from.
 
     Args:
         levels: the levels, the finest first.
