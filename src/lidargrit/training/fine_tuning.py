@@ -28,11 +28,6 @@ def divided(data: str, reporter: Reporter, max_scans: int = 0) -> DataConfig:
 
     Args:
         data: name of a data set, or of a folder of scans.
-        reporter: receiver of the warning.
-        max_scans: largest number of scans taken from each part; 0 for all.
-
-    Raises:
-        DataError: too few scans to hold any out.
     """
     dataset = open_source(data).scans()
     if len(dataset) < 4:
@@ -69,10 +64,6 @@ def fine_tuning_preset(data: str, reporter: Reporter, sensor: str = "", settings
         reporter: receiver of a warning where train and val may show the same streets.
         sensor: name or ``.json`` file of the sensor that made the scans; that of the data set if empty.
         settings: changed settings of the preset, as ``--set`` takes them.
-
-    Raises:
-        DataError: too few scans to hold any out.
-        ConfigError: a sensor with another number of rows than ``pretrained``, whose weights do not fit.
     """
     config = divided(data, reporter)
     own, made_by = load(PRETRAINED).sensor, load_sensor(sensor or config.sensor)
@@ -95,12 +86,7 @@ def fine_tuning_preset(data: str, reporter: Reporter, sensor: str = "", settings
 
 
 def columns_like(wanted: SensorModel, sensor: SensorModel) -> tuple[int, int]:
-    """Return the number of fine columns, and the step between kept ones, of images of a sensor as wide as wanted.
-
-    Args:
-        wanted: sensor whose width the images have.
-        sensor: sensor that made the scans.
-    """
+    """Return the number of fine columns, and the step between kept ones, of images of a sensor as wide as wanted."""
     fine = sensor.width * sensor.column_stride
     stride = max(1, round(fine / wanted.width))
     return wanted.width * stride, stride
