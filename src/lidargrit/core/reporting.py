@@ -234,7 +234,6 @@ def _words(speed: float, left_s: float, all_left_s: float) -> str:
 
 
 def _minutes(seconds: float) -> str:
-    """Return a time as minutes and seconds, or hours, minutes and seconds."""
     whole = round(min(seconds, 1e7))
     hours, rest = divmod(whole, 3600)
     return f"{hours}:{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"

@@ -28,10 +28,6 @@ def divided(data: str, max_scans: int = 0) -> DataConfig:
 
     Args:
         data: name of a data set, or of a folder of scans.
-        max_scans: largest number of scans taken from each part; 0 for all.
-
-    Raises:
-        DataError: too few scans to hold any out.
     """
     dataset = open_source(data).scans()
     if len(dataset) < 4:
@@ -67,10 +63,6 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
         data: name of a data set, or of a folder of scans.
         sensor: name or ``.json`` file of the sensor that made the scans; that of the data set if empty.
         settings: changed settings of the preset, as ``--set`` takes them.
-
-    Raises:
-        DataError: too few scans to hold any out.
-        ConfigError: a sensor with another number of rows than ``pretrained``, whose weights do not fit.
     """
     config = divided(data)
     own, made_by = load(PRETRAINED).sensor, load_sensor(sensor or config.sensor)
@@ -93,12 +85,7 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
 
 
 def columns_like(wanted: SensorModel, sensor: SensorModel) -> tuple[int, int]:
-    """Return the number of fine columns, and the step between kept ones, of images of a sensor as wide as wanted.
-
-    Args:
-        wanted: sensor whose width the images have.
-        sensor: sensor that made the scans.
-    """
+    """Return the number of fine columns, and the step between kept ones, of images of a sensor as wide as wanted."""
     fine = sensor.width * sensor.column_stride
     stride = max(1, round(fine / wanted.width))
     return wanted.width * stride, stride

@@ -131,12 +131,7 @@ def _plot(
 
 
 def check_folder(folder: Path, preset: Preset) -> None:
-    """Refuse a folder that holds something else than a run of this preset.
-
-    Raises:
-        OutputError: the folder holds another run or other files.
-        CheckpointError: its ``run.json`` cannot be used.
-    """
+    """Refuse a folder that holds something else than a run of this preset."""
     if (folder / RUN_FILE).exists():
         about, mine = read_json(folder / RUN_FILE), configuration.leaves(configuration.to_json(preset))
         if not (other := preset_settings(about)):

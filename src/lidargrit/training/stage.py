@@ -83,11 +83,6 @@ class StageTraining:
     def run(self, train: RangeImages, val: RangeImages, what: str) -> Objective:
         """Train until all scans of the budget are seen, and return the objective with its averaged weights.
 
-        Args:
-            train: range images to learn from.
-            val: range images for validation.
-            what: text beside the progress bar.
-
         Raises:
             TrainingError: the loss is not finite; names the scans seen and the last good checkpoint.
             OutputError: a checkpoint could not be written; the one before it is intact.
@@ -204,11 +199,7 @@ class StageTraining:
 
 
 def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine, torch.optim.Optimizer]:
-    """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser.
-
-    Raises:
-        ConfigError: settings that the objective's networks or the processes cannot follow.
-    """
+    """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser."""
     engine = Engine(config.precision, objective.reaches_all_weights and not objective.players)
     optimiser = follow_settings(objective, config, engine.world_size)
     engine.set_up(objective, optimiser)
@@ -216,15 +207,7 @@ def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine
 
 
 def follow_settings(objective: Objective, config: TrainingConfig, processes: int) -> torch.optim.Optimizer:
-    """Set an objective's networks as the settings of its training say, and return the optimiser.
-
-    Args:
-        processes: number of processes that share each batch.
-
-    Raises:
-        ConfigError: a process cannot divide its share of a batch into the parts asked for, or the networks lack what
-            is to be recomputed, compiled or trained by Muon.
-    """
+    """Set an objective's networks as the settings of its training say, and return the optimiser."""
     _check_parts(objective, config, processes)
     if config.compile:
         _check_compiler()
