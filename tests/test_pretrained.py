@@ -122,7 +122,7 @@ def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
 
 
 def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys):
-    assert main(["evaluate", "pretrained", "simulated:8:test", "--json"]) == 0
+    assert main(["likelihood", "simulated:8:test", "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)["reconstruction"]
     assert errors["range_mae_m"] == pytest.approx(1.128, rel=0.02)
     assert errors["mask_accuracy"] == pytest.approx(0.934, abs=0.004)

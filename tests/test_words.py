@@ -28,7 +28,7 @@ MISTAKES = {
     "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
     "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
     "train lidargrit_demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
-    "completion tcsh": "got 'tcsh'; wanted bash, zsh or fish; choose one",
+    "--print-completion tcsh": "got --print-completion tcsh; wanted bash, zsh or fish; choose one",
     "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --variant exakt": "got variant 'exakt'; wanted one such as exact or textbook; choose one",
@@ -103,7 +103,7 @@ def test_json_is_all_of_standard_output_or_a_file_besides(words, capsys, tmp_pat
 
 
 def test_every_verb_that_reports_knows_json():
-    silent = {"complete", "completion", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
+    silent = {"complete", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
     silent |= {"compress", "decompress", "fine-tune", "rescan", "simulate", "upsample", "view"}
     parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
     assert parsers.keys() == {name.replace("_", "-") for name in discovery.names("cli")}
@@ -129,7 +129,7 @@ def test_help_tells_the_exit_codes(capsys):
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
-    assert main(["completion", shell]) == 0
+    assert main(["--print-completion", shell]) == 0
     script = tmp_path / "script"
     script.write_text(capsys.readouterr().out)
     for word in (*discovery.names("cli"), *discovery.names("presets"), "lidargrit-kitti-360", "dry-run"):
@@ -140,7 +140,7 @@ def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="needs bash")
 def test_bash_completes(capsys, tmp_path):
-    assert main(["completion", "bash"]) == 0
+    assert main(["--print-completion", "bash"]) == 0
     (tmp_path / "script").write_text(capsys.readouterr().out)
     for words, offered in (
         ("tra", "train"),

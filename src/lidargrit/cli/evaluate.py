@@ -1,9 +1,9 @@
-"""Score samples against real scans, measure a run's reconstruction errors, or print saved scores side by side."""
+"""Score samples or simulated streets against real scans, or print saved scores side by side."""
 
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_scans, scan_settings
+from lidargrit.cli._options import add_scans
 from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
@@ -11,7 +11,7 @@ EXAMPLES = """\
   lidargrit evaluate samples /data/held_out --report report.html
   lidargrit evaluate samples kitti_360:/data/kitti_360:test --protocol lidargrit-kitti-360 --json scores.json
   lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
-  lidargrit evaluate runs/mine /data/held_out          errors of reconstruction, for a run instead of samples
+  lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
   lidargrit evaluate --tables ours.json theirs.json --format markdown
 """
 
@@ -19,7 +19,7 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     add = parser.add_argument
-    samples = "samples of lidargrit or of another program (.pth), a source of scans, or a run"
+    samples = "samples of lidargrit or of another program (.pth), or a source of scans"
     add("samples", nargs="?", default="", help=samples)
     add("reference", nargs="?", default="", help="scans to compare with; projected with the sensor of the samples")
     add("--protocol", default="exact", help="metrics and their definitions, see: lidargrit list protocols")
@@ -34,7 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=seed_number, default=0, help="seed of all random choices")
     add("--device", default="cpu", help="device of networks: cpu, or cuda, which changes the last digits of scores")
     add_scans(parser)
-    add("--report", type=Path, metavar="FILE.html", help="also write a page with scores and pictures")
+    drops = "run that drops returns of clean scans; of simulated streets by the protocol streets, its drops count too"
+    add("--model", default="", metavar="RUN", help=drops)
+    page = "also write a page with scores and pictures (.html), or the curves of simulated streets (.png)"
+    add("--report", type=Path, metavar="FILE", help=page)
     add_json(parser, "the files of --json and --report")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
     add("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
@@ -42,17 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
-    from lidargrit.core.reporting import TerminalReporter
-    from lidargrit.evaluation.command import check_modes, evaluate, read_config
+    from lidargrit.cli._evaluation import evaluated
+    from lidargrit.evaluation.command import check_modes
     from lidargrit.evaluation.tables import read_tables
-    from lidargrit.viewer.report import write_report
 
     refuse_taken(options)
     check_modes(vars(options), options.words.get_default)
     if options.tables:
         return print_result(options, *read_tables(options.tables, options.format))
-    names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"
-    config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
-    sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
-    text, values, also = evaluate(*sets, config, TerminalReporter(), *report)
+    text, values, also = evaluated(options)
     print_result(options, text, values, files_told(scores=options.json, report=options.report), also)

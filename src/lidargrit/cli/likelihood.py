@@ -1,4 +1,4 @@
-"""Measure the likelihood of scans under a model, in bits: tokens, mask and ranges."""
+"""Measure scans under a model: their likelihood in bits, and the errors of their reconstructions."""
 
 import argparse
 from pathlib import Path
@@ -32,17 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Count the bits and print a table."""
+    """Measure, and print the tables."""
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.evaluation.likelihood import likelihood_of_source
+    from lidargrit.evaluation.likelihood import measure_source
 
     refuse_taken(options)
     if options.map is not None:
         refuse_to_overwrite(options.map, options.overwrite, ".npy")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.model, options.step_mm)
-    found = likelihood_of_source(*named, config, TerminalReporter(), options.map, options.device)
-    result = {"model": options.model, "source": options.scans, **found.as_json()}
-    print_result(options, found.as_table(), result)
+    print_result(options, *measure_source(*named, config, TerminalReporter(), options.map, options.device))
