@@ -257,8 +257,14 @@ def test_a_file_that_was_cut_off_is_refused_and_bare_coordinates_stay_bare(tmp_p
 
 def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, capsys):
     table = tmp_path / "table.json"
-    words = ["compare-completion", f"{folders}/scans", f"{folders}/run", f"{folders}/run:mask=threshold"]
-    assert main([*words, "nearest", "triangulation", "--observed", "rows:4", "pixels:0.3", "--json", str(table)]) == 0
+    models = [f"{folders}/run", f"{folders}/run:mask=threshold", "nearest", "triangulation"]
+
+    def compared(folder, models, *more):
+        words = ["compare", str(tmp_path / folder), *models, "--protocol", "completion"]
+        return main([*words, "--reference", f"{folders}/scans", *more])
+
+    assert compared("out", models, "--observed", "rows:4", "pixels:0.3", "--json", str(table)) == 0
+    assert (tmp_path / "out" / "completion.json").read_bytes() == table.read_bytes()
     output = capsys.readouterr().out
     scores = json.loads(table.read_text())["scores"]
     assert [score["observed"] for score in scores] == ["rows:4"] * 4 + ["pixels:0.3"] * 4
@@ -269,9 +275,13 @@ def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, cap
     assert run["diversity_m"]["value"] > 0.1
     difference = nearest["mae_m"]["value"] - triangles["mae_m"]["value"]
     assert nearest["beside_triangulation_m"]["value"] == pytest.approx(difference)
-    assert main([*words[:2], "nearest", "--observed", "returns", "--sensor", f"{folders}/sensor.json"]) == 2
+    assert compared("out", ["nearest"]) == 2
+    assert "completion.json, which is there already" in capsys.readouterr().err
+    assert compared("other", ["nearest"], "--flops", "1e9") == 2
+    assert "got --flops with --protocol completion" in capsys.readouterr().err
+    assert compared("other", ["nearest"], "--observed", "returns", "--sensor", f"{folders}/sensor.json") == 2
     assert "got --observed returns, which hides no return of these scans" in capsys.readouterr().err
-    assert main([*words[:2], f"{folders}/run:mask=guess"]) == 2
+    assert compared("other", [f"{folders}/run:mask=guess"]) == 2
     assert "mask=guess" in capsys.readouterr().err
 
 

@@ -189,11 +189,11 @@ def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
     assert "got the run pretrained, which holds no scans" in error
     assert "lidargrit likelihood simulated:2:test --model pretrained" in error
     for words, got in (
-        (["samples", "--tables", "a.json"], "--tables and samples"),
-        (["--tables", "a.json", "--protocol", "r2dm"], "--tables and --protocol"),
-        (["--tables", "a.json", "-n", "3"], "--tables and --max-scans"),
-        (["--tables", "a.json", "--set", "data.columns=64"], "--tables and --set"),
-        (["a", "b", "--format", "latex"], "--format latex without --tables"),
+        (["samples", "--tables", "a.json"], "samples beside --tables"),
+        (["--tables", "a.json", "--protocol", "r2dm"], "--protocol beside --tables"),
+        (["--tables", "a.json", "-n", "3"], "--max-scans beside --tables"),
+        (["--tables", "a.json", "--set", "data.columns=64"], "--set beside --tables"),
+        (["a", "b", "--table", "latex"], "--table without --tables"),
         (["a", "b", "--report", str(tmp_path / "r.png")], "r.png, which will hold HTML"),
     ):
         assert main(["evaluate", *words]) == 2
@@ -361,7 +361,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     assert " ".join(head.split()) == "metric variant score 95 % interval real against real better scans"
     assert len(rows) == 2
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--format", "latex"]) == 0
+    assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--table", "latex"]) == 0
     assert "tabular" in capsys.readouterr().out
     for wrong, message in (
         ([*words, *files], "there already"),

@@ -324,7 +324,7 @@ def test_compare_tells_the_bits_of_whole_scans_where_a_system_has_them(tmp_path,
     made().save(tmp_path / "with_pixels")
     made(None).save(tmp_path / "tokens_alone")
     systems = [str(tmp_path / "with_pixels"), str(tmp_path / "tokens_alone")]
-    words = ["compare", str(tmp_path / "table"), *systems, "--against", "simulated:2:test", "-n", "2"]
+    words = ["compare", str(tmp_path / "table"), *systems, "--reference", "simulated:2:test", "-n", "2"]
     words += ["--metrics", "bev_jsd"]
     assert main([*words, "--json"]) == 0
     with_pixels, tokens_alone = (cell["costs"] for cell in json.loads(capsys.readouterr().out))

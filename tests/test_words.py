@@ -20,7 +20,7 @@ MISTAKES = {
     "sample run out -x": "got the option '-x'; wanted one such as",
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
-    "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
+    "evaluate a b --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
     "list metric": "wanted one such as metrics; see: lidargrit list --help",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol, --projection or --projection-variant; write it out",

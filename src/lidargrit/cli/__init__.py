@@ -115,6 +115,7 @@ def build_parser() -> Parser:
         sub.set_defaults(goes_on=False)  # a verb that keeps what it has done, and goes on there, says so itself
         verb.add_arguments(sub)
         sub.set_defaults(run=verb.run, words=sub)
+        sub.usage = sub.short_usage()
     return parser
 
 

@@ -5,29 +5,33 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from lidargrit.cli._options import scan_settings
+from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
 
-_NAMES = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"
+_OF_TABLES = ("tables", "table")
+_OF_BOTH = ("samples", "reference", "protocol", "max_scans", "device", "report", *SCANS)
+_OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
 def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
-    """Score by the options; simulated streets by the protocol of this name have a picture in place of a page."""
-    from lidargrit.core.errors import ConfigError
+    """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.command import evaluate, evaluate_streets, read_config, streets_of
+    from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
 
-    config = read_config(scan_settings(options), **{name: vars(options)[name] for name in _NAMES.split()})
+    if options.tables:
+        refuse_unused(options, "beside --tables", _OF_TABLES)
+        return *read_tables(options.tables, options.table), None
+    names = ("protocol", "max_scans", "device", *_OF_CARDS)
+    config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names})
     sets = (options.samples, options.reference)
     streets = streets_of(options.samples, config) if options.reference else None
     if streets is None:
-        if options.model:
-            got, wanted = f"--model {options.model}", "simulated:COUNT and --protocol streets beside it"
-            raise ConfigError(got, wanted, "leave it out, or see lidargrit likelihood --help")
-        report = (options.report, write_report, options.overwrite)
-        return evaluate(*sets, config, TerminalReporter(), *report)
+        refuse_unused(options, "without --tables or --protocol streets", (*_OF_BOTH, *_OF_CARDS))
+        return evaluate(*sets, config, TerminalReporter(), options.report, write_report, options.overwrite)
+    refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model"))
     refuse_to_overwrite(options.report, options.overwrite, ".png")
     text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model, TerminalReporter())
     plot = partial(plot_curves, curves, options.report, f"real: {options.reference}") if options.report else None

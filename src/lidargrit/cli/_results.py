@@ -27,6 +27,11 @@ def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json")
     parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if already there")
 
 
+def add_table(parser: argparse.ArgumentParser) -> None:
+    """Add ``--table``, the form of a printed table."""
+    parser.add_argument("--table", choices=["text", "markdown", "latex"], default="text", help="form of the table")
+
+
 def refuse_taken(options: argparse.Namespace, *others: Path) -> None:
     """Refuse, before any work, to replace a file that ``--json`` names, or ``others`` of the verb, with OutputError."""
     if options.json in (None, STANDARD_OUTPUT):

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._evaluation import evaluated
 from lidargrit.cli._options import add_scans
-from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
+from lidargrit.cli._results import add_json, add_table, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
@@ -12,7 +13,7 @@ EXAMPLES = """\
   lidargrit evaluate samples kitti_360:/data/kitti_360:test --protocol lidargrit-kitti-360 --json scores.json
   lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
   lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
-  lidargrit evaluate --tables ours.json theirs.json --format markdown
+  lidargrit evaluate --tables ours.json theirs.json --table markdown
 """
 
 
@@ -40,18 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--report", type=Path, metavar="FILE", help=page)
     add_json(parser, "the files of --json and --report")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
-    add("--format", choices=["text", "markdown", "latex"], default="text", help="format of the table")
+    add_table(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
-    from lidargrit.cli._evaluation import evaluated
-    from lidargrit.evaluation.command import check_modes
-    from lidargrit.evaluation.tables import read_tables
-
     refuse_taken(options)
-    check_modes(vars(options), options.words.get_default)
-    if options.tables:
-        return print_result(options, *read_tables(options.tables, options.format))
     text, values, also = evaluated(options)
     print_result(options, text, values, files_told(scores=options.json, report=options.report), also)

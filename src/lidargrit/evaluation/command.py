@@ -1,7 +1,6 @@
 """Two names and a configuration → scores: what ``lidargrit evaluate`` does."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,6 @@ from lidargrit.evaluation.raydrop import raydrop_json, raydrop_model, raydrop_ta
 from lidargrit.evaluation.realism import CurveScore, as_json, as_table, compare, scans_of_both
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.nn.devices import usable_device
-
-_OF_TABLES = ("tables", "format", "json", "overwrite", "debug", "verb")  # options that printing takes as well
 
 
 def evaluate(
@@ -75,29 +72,12 @@ def evaluate(
 
 
 def streets_of(samples: str, config: EvalConfig) -> Streets | None:
-    """Return the simulated streets that the protocol ``streets`` scores; None for other samples and protocols.
-
-    Raises:
-        ConfigError: settings of scorecards, which the curves of streets do not follow.
-    """
+    """Return the simulated streets that the protocol ``streets`` scores; None for other samples and protocols."""
     if public_name(config.protocol) != "streets" or not samples.startswith("simulated"):
         return None
     source = open_source(samples, config.data.bad_points)
     streets = source.scans() if isinstance(source, DatasetSource) else None
-    if not isinstance(streets, Streets):
-        return None
-    given = {
-        "--metrics": bool(config.metrics),
-        "--variant": bool(config.variant),
-        "--weights": bool(config.weights),
-        "--pixel-statistics": config.pixel_statistics,
-        "--intervals or --groups": replace(config.resampling, seed=0) != Resampling(),
-        "--seed": config.resampling.seed != 0,
-    }
-    if wrong := [option for option, is_given in given.items() if is_given]:
-        cure = "leave it out, or name the metrics without --protocol"
-        raise ConfigError(f"{wrong[0]} with --protocol streets", "the curves of this protocol", cure)
-    return streets
+    return streets if isinstance(streets, Streets) else None
 
 
 def evaluate_streets(
@@ -127,25 +107,6 @@ def evaluate_streets(
     text = "\n\n".join([as_table(scores), *([raydrop_table(of_model)] if drops else [])])
     about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
     return text, {**about, "curves": as_json(scores), "raydrop": raydrop_json(of_model)}, scores
-
-
-def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) -> None:
-    """Refuse words for scoring beside ``--tables``, which only prints, and a format of tables without it.
-
-    Args:
-        options: values of all options, by their names.
-        default_of: function that returns the default of an option.
-
-    Raises:
-        ConfigError: they are mixed.
-    """
-    of_scoring = [name for name, value in options.items() if name not in _OF_TABLES and value != default_of(name)]
-    if options["tables"] and of_scoring:
-        got = f"--tables and {options['samples'] or '--' + of_scoring[0].replace('_', '-')}"
-        raise ConfigError(got, "files of scores to print, or sets to score", "run the two one after the other")
-    if options["format"] != "text" and not options["tables"]:
-        cure = "score with --json FILE.json, then print it with --tables FILE.json"
-        raise ConfigError(f"--format {options['format']} without --tables", "files of scores to print", cure)
 
 
 def read_config(
