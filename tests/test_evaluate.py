@@ -191,7 +191,7 @@ def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
     for words, got in (
         (["samples", "--tables", "a.json"], "samples beside --tables"),
         (["--tables", "a.json", "--protocol", "r2dm"], "--protocol beside --tables"),
-        (["--tables", "a.json", "-n", "3"], "--max-scans beside --tables"),
+        (["--tables", "a.json", "-n", "3"], "--count beside --tables"),
         (["--tables", "a.json", "--set", "data.columns=64"], "--set beside --tables"),
         (["a", "b", "--table", "latex"], "--table without --tables"),
         (["a", "b", "--report", str(tmp_path / "r.png")], "r.png, which will hold HTML"),

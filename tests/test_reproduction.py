@@ -142,7 +142,7 @@ def test_another_number_and_another_place_are_refused(tmp_path, capsys):
         ([*table, "--data", str(tmp_path), "--dry-run"], "KITTI odometry"),
         (table, "got --paper-table 2 without --data"),
         ([*table, "--data", "simulated", "--protocol", "exact"], "got --protocol with --paper-table 2"),
-        ([*table, "marginal", "--data", "simulated"], "got marginal with --paper-table 2"),
+        ([*table[:2], "marginal", *table[2:], "--data", "simulated"], "got marginal with --paper-table 2"),
         (["compare", str(tmp_path / "out"), "marginal", "--small"], "got --small without --paper-table"),
     ):
         assert main(words) == 2

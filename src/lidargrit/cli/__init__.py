@@ -96,8 +96,8 @@ def _let_threads_sleep() -> None:
 
 def build_parser() -> Parser:
     """Return the parser of all verbs; the verbs themselves are not imported beyond their words."""
-    raw: dict[str, Any] = {"formatter_class": HelpFormatter, "epilog": EXIT_CODES}
-    parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, **raw)
+    raw: dict[str, Any] = {"formatter_class": HelpFormatter}
+    parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, epilog=EXIT_CODES, **raw)
     parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
     parser.add_argument("--debug", action="store_true", help="show a full traceback of an error")
     how = "print a script by which this shell completes verbs, options and names, see docs/how-to/from-programs.md"

@@ -101,9 +101,11 @@ def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Hide parts of whole scans, have every model fill them in, and return the table and its plain values."""
     from lidargrit.core.files import refuse_to_overwrite, write_json
     from lidargrit.core.reporting import TerminalReporter
+    from lidargrit.data.sources import open_source
+    from lidargrit.data.sources.scan_sensor import sensor_for
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
     from lidargrit.inference.complete import is_classical, open_models
-    from lidargrit.inference.complete.inputs import images_for, sensor_of
+    from lidargrit.inference.complete.inputs import images_for
     from lidargrit.inference.complete.patterns import Pattern
     from lidargrit.scans.fills import FILLS
 
@@ -114,8 +116,10 @@ def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     words, scans = options.systems or ["pretrained", *FILLS], options.reference or DEFAULTS["reference"]
     settings = scan_settings(options, max_scans=32 if options.count is None else options.count)
     named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
-    sensor = settings.data.imaged(sensor_of(scans, settings.sensor)) if named else None
-    models, reporter = open_models(words, sensor, options.device), TerminalReporter()
+    reporter = TerminalReporter()
+    source = open_source(scans, settings.data.bad_points)
+    sensor = settings.data.imaged(sensor_for(source, settings.sensor, reporter)) if named else None
+    models = open_models(words, sensor, options.device)
     images = images_for(models, scans, settings, reporter)
     scores = compare_completion(images, models, patterns, options.samples, options.seed, reporter)
     found = {"reference": scans, "scores": as_json(scores)}

@@ -8,7 +8,7 @@ from typing import Any
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
 
 _OF_TABLES = ("tables", "table")
-_OF_BOTH = ("samples", "reference", "protocol", "max_scans", "device", "report", *SCANS)
+_OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
 _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
@@ -24,8 +24,10 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     if options.tables:
         refuse_unused(options, "beside --tables", _OF_TABLES)
         return *read_tables(options.tables, options.table), None
-    names = ("protocol", "max_scans", "device", *_OF_CARDS)
-    config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names})
+    names = ("protocol", "device", *_OF_CARDS)
+    config = read_config(
+        scan_settings(options, max_scans=options.count), **{name: vars(options)[name] for name in names}
+    )
     sets = (options.samples, options.reference)
     streets = streets_of(options.samples, config) if options.reference else None
     if streets is None:

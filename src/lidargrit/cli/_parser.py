@@ -27,7 +27,19 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """Adds its default to the help of every option that has one and does not describe it itself."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=30)  # where help of every verb takes the fewest lines
+        super().__init__(prog, max_help_position=25)  # where help of every verb takes the fewest lines
+
+    def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
+        """Return what follows an option's name: WORD ... in place of argparse's WORD [WORD ...]."""
+        if action.nargs in ("+", "*"):
+            return f"{action.metavar or default_metavar} ..."
+        return super()._format_args(action, default_metavar)
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        """Return the names of an option, with what follows them once."""
+        if not action.option_strings or action.nargs == 0:
+            return super()._format_action_invocation(action)
+        return f"{', '.join(action.option_strings)} {self._format_args(action, action.dest.upper())}"
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text = action.help or ""

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._evaluation import evaluated
-from lidargrit.cli._options import add_scans
+from lidargrit.cli._options import add_count, add_device, add_scans
 from lidargrit.cli._results import add_json, add_table, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
@@ -23,22 +23,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     samples = "samples of lidargrit or of another program (.pth), or a source of scans"
     add("samples", nargs="?", default="", help=samples)
     add("reference", nargs="?", default="", help="scans to compare with; projected with the sensor of the samples")
-    add("--protocol", default="exact", help="metrics and their definitions, see: lidargrit list protocols")
-    add("--metrics", nargs="+", default=[], help="metrics instead of the protocol's, see: lidargrit list metrics")
-    add("--variant", default="", help="published definition of every metric; see: lidargrit list metrics")
-    add("--samples-format", default="", help="program that wrote .pth files: r2dm, lidargen or lidargrit")
+    add("--protocol", default="exact", metavar="NAME", help="metrics and definitions: lidargrit list protocols")
+    add("--metrics", nargs="+", default=[], metavar="NAME", help="others than its: lidargrit list metrics")
+    add("--variant", default="", metavar="NAME", help="published definition of every metric")
+    add("--samples-format", default="", metavar="NAME", help="program of .pth files: r2dm, lidargen or lidargrit")
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
-    add("-n", "--max-scans", type=int, default=0, help="largest number of scans of each; 0 for the protocol's")
-    add("--intervals", type=int, default=20, metavar="B", help="number of half-samples for 95 %% intervals; 0 for none")
-    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which any model has to beat")
-    add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples; odd: rounded down")
-    add("--seed", type=seed_number, default=0, help="seed of all random choices")
-    add("--device", default="cpu", help="device of networks: cpu, or cuda, which changes the last digits of scores")
+    add_count(parser, help="largest number of scans; 0 for the protocol's")
+    add("--intervals", type=int, default=20, metavar="B", help="half-samples for 95 %% intervals; 0 for none")
+    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which a model has to beat")
+    add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples")
+    add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
+    add_device(parser)
     add_scans(parser)
-    drops = "run that drops returns of clean scans; of simulated streets by the protocol streets, its drops count too"
-    add("--model", default="", metavar="RUN", help=drops)
-    page = "also write a page with scores and pictures (.html), or the curves of simulated streets (.png)"
-    add("--report", type=Path, metavar="FILE", help=page)
+    add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
+    add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
     add_json(parser, "the files of --json and --report")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
     add_table(parser)

@@ -87,7 +87,7 @@ def evaluate_streets(
 
     Args:
         samples: name of the streets.
-        streets: what :func:`streets_of` returned.
+        streets: streets of this name, by :func:`streets_of`.
         reference: source of real scans.
         model: run that drops returns of clean scans, which is compared too; none if empty.
 

@@ -1,11 +1,14 @@
 """Sources of scans, by what a user types → one object with the kind, the data and the provenance of the source."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
-from lidargrit.core.errors import DataError, LidarGritError
+from lidargrit.core.errors import DataError, LidarGritError, ScanError
 from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
+from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -23,6 +26,8 @@ from lidargrit.data.sources.sample_formats import (
 )
 from lidargrit.data.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
 from lidargrit.data.sources.source import Source
+from lidargrit.scans.many_scans import usable_scans
+from lidargrit.scans.projection.sensor_check import closest_sensor
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
@@ -46,8 +51,25 @@ class DatasetSource(Source):
 
     @property
     def sensor(self) -> SensorModel:
-        """Sensor that made the scans."""
-        return load_sensor(self._dataset.sensor)
+        """Sensor that made the scans; see :attr:`sensor_name`."""
+        return load_sensor(self.sensor_name)
+
+    @property
+    def sensor_name(self) -> str:
+        """Name or file of the sensor that made the scans; of files that name none, the one that looks closest."""
+        return self._sensor_name
+
+    @cached_property
+    def _sensor_name(self) -> str:
+        if self.data_set != "folder" or self._dataset.sensor != Folder.sensor:
+            return self._dataset.sensor
+        try:
+            (scan,), _ = usable_scans(self._dataset, range(len(self._dataset)), at_most=1)
+        except ScanError:  # of all of them, and told where they are used
+            return self._dataset.sensor
+        name = closest_sensor(scan)
+        self.guess = f"{self.text}: no sensor is named, so {name} is taken, which looks closest; --sensor names another"
+        return name
 
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant of the images that were opened last, else the one that the configuration names."""
@@ -78,7 +100,9 @@ class DatasetSource(Source):
             sensor: sensor of the images; the data set's own, with the configuration's columns, if not given.
             config: settings of the projection.
         """
-        return choose_imaging(self.text, self._dataset, sensor or config.imaged(self.sensor), config)
+        sensor = sensor or config.imaged(self.sensor)
+        imaging = choose_imaging(self.text, self._dataset, sensor, config)
+        return replace(imaging, notes=(self.guess, *imaging.notes)) if self.guess else imaging
 
 
 class PreparedSource(Source):

@@ -28,6 +28,9 @@ class Source(ABC):
     doubts: tuple[str, ...] = ()
     """Reasons to doubt the images that were opened last: made by another sensor, or of mixed scales of reflectance."""
 
+    guess: str = ""
+    """Sentence on the sensor, if it was guessed from the scans when it was asked for."""
+
     def __init__(self, text: str) -> None:
         self.text = text
 
@@ -35,6 +38,11 @@ class Source(ABC):
     @abstractmethod
     def sensor(self) -> SensorModel:
         """Sensor whose rays the scans or images lie on."""
+
+    @property
+    def sensor_name(self) -> str:
+        """Name or file of the sensor that made the scans; "" for images, which hold theirs."""
+        return ""
 
     @abstractmethod
     def projection_variant(self, config: DataConfig) -> str:

@@ -24,7 +24,7 @@ from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, ind
 from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
-from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.scans.sensors import ProjectionName, ProjectionOption, SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
 
@@ -157,12 +157,14 @@ class ScanReader:
     Args:
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
+        projection: way in which points find their rows; ``sensor`` for what fits the points.
         few_rings_cure: cure of a scan of far fewer rows.
     """
 
     sensor: SensorModel
     variant: ProjectionVariant = "exact"
     partial: bool = False
+    projection: ProjectionOption = "sensor"
     few_rings_cure: str = (
         "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor"
     )
@@ -175,6 +177,8 @@ class ScanReader:
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
                 self.few_rings_cure,
             )
+        if self.projection != "sensor":
+            return self._read(scan, self.projection)
         method = projection_that_fits(scan, self.sensor)
         try:
             return self._read(scan, method)
@@ -239,8 +243,3 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: R
             "name a model for such images with --model, or give the scans as points",
         )
     return Inputs(scans, reader, reporter)
-
-
-def sensor_of(source: str, name: str = "") -> SensorModel:
-    """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
-    return load_sensor(name) if name else open_source(source).sensor

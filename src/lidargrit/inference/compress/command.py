@@ -61,7 +61,7 @@ def compress_scans(
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
-    reader = ScanReader(codec.sensor, projection_variant(locate(model)))
+    reader = ScanReader(codec.sensor, projection_variant(locate(model)), projection=config.projection)
     inputs = open_inputs(source, reader, config, reporter)
     check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
     chosen = {"source": source, "max_scans": config.max_scans}
