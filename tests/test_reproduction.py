@@ -12,7 +12,6 @@ import pytest
 from lidargrit.cli import main
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import load
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction, prepare
@@ -131,7 +130,7 @@ def test_settings_that_a_stage_cannot_follow_are_told_before_any_scan(monkeypatc
     monkeypatch.delattr("lidargrit.evaluation.reproduction.load_range_images")
     wrong = Reproduction(3, "simulated", small=True, flops=0.0, settings=("training.tokenizer.optimiser=muon",))
     with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
-        prepare(wrong.benchmark(), [*wrong.systems().values()], Reporter())
+        prepare(wrong.benchmark(), [*wrong.systems().values()])
 
 
 def test_another_number_and_another_place_are_refused(tmp_path, capsys):

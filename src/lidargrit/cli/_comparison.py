@@ -30,7 +30,6 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
     The same command goes on, but for completions, which begin anew.
     """
     from lidargrit.core.files import write_text
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.benchmark import as_json, as_table, run
     from lidargrit.evaluation.reproduction import plan, plan_as_text, prepare
     from lidargrit.evaluation.table_folder import write_table
@@ -39,14 +38,14 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
     if options.protocol == COMPLETION:
         options.goes_on = False
         return *_completions(options), f"done: the same as JSON in {options.out / COMPLETED}"
-    paper, reporter = _paper_table(options), TerminalReporter()
+    paper = _paper_table(options)
     if paper and options.dry_run:
         facts = plan(paper, options.out)
         return plan_as_text(paper, facts), facts, ""
     systems, benchmark = ([*paper.systems().values()], paper.benchmark()) if paper else _systems(options)
     if paper:
-        prepare(benchmark, systems, reporter)
-    scores = run(systems, options.out, benchmark, reporter, options.workers)
+        prepare(benchmark, systems)
+    scores = run(systems, options.out, benchmark, options.workers)
     write_table(options.out, systems, benchmark, scores)
     write_text(options.out / "table.html", table_page(as_json(scores), benchmark.flops))
     done = f"done: {options.out / 'table.html'} sorts the table in a browser"
@@ -100,7 +99,6 @@ def _paper_table(options: argparse.Namespace) -> "Reproduction | None":
 def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Hide parts of whole scans, have every model fill them in, and return the table and its plain values."""
     from lidargrit.core.files import refuse_to_overwrite, write_json
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.sources import open_source
     from lidargrit.data.sources.scan_sensor import sensor_for
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
@@ -116,12 +114,11 @@ def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     words, scans = options.systems or ["pretrained", *FILLS], options.reference or DEFAULTS["reference"]
     settings = scan_settings(options, max_scans=32 if options.count is None else options.count)
     named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
-    reporter = TerminalReporter()
     source = open_source(scans, settings.data.bad_points)
-    sensor = settings.data.imaged(sensor_for(source, settings.sensor, reporter)) if named else None
+    sensor = settings.data.imaged(sensor_for(source, settings.sensor)) if named else None
     models = open_models(words, sensor, options.device)
-    images = images_for(models, scans, settings, reporter)
-    scores = compare_completion(images, models, patterns, options.samples, options.seed, reporter)
+    images = images_for(models, scans, settings)
+    scores = compare_completion(images, models, patterns, options.samples, options.seed)
     found = {"reference": scans, "scores": as_json(scores)}
     write_json(file, found)
     return as_table(scores), found

@@ -53,7 +53,6 @@ def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorMod
 
 def named_sensor(options: argparse.Namespace, is_needed: bool) -> "SensorModel | None":
     """Return the sensor that the user named, else where one is needed that of the source, which is told if guessed."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.sources import open_source
     from lidargrit.data.sources.scan_sensor import sensor_for
 
@@ -61,18 +60,17 @@ def named_sensor(options: argparse.Namespace, is_needed: bool) -> "SensorModel |
     if not (settings.sensor or is_needed):
         return None
     source = open_source(options.scans, settings.data.bad_points)
-    return settings.data.imaged(sensor_for(source, settings.sensor, TerminalReporter()))
+    return settings.data.imaged(sensor_for(source, settings.sensor))
 
 
 def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:
     """Do a task with every scan, and say how many points came in and went out, and how to look at them."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.inference.complete.command import complete_scans
     from lidargrit.inference.complete.files import OutputConfig
 
     output = OutputConfig(options.samples, options.seed, options.format, probability)
     config = scan_settings(options, max_scans=options.count).data
-    found = complete_scans(options.scans, options.out, model, task, output, config, TerminalReporter())
+    found = complete_scans(options.scans, options.out, model, task, output, config)
     kind = {"complete": "completed", "upsample": "upsampled", "raydrop": "dropped"}[task.verb]
     print(f"done: {counted_scans(found.scans, kind)} in {options.out}{_points(found, task)}")
     print(f"look at {'it' if found.scans == 1 else 'them'}: {_view(options, found, model)}")

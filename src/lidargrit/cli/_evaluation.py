@@ -15,7 +15,6 @@ _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups"
 def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
     """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.command import evaluate, evaluate_streets, read_config, streets_of
     from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.curves import plot_curves
@@ -32,9 +31,9 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     streets = streets_of(options.samples, config) if options.reference else None
     if streets is None:
         refuse_unused(options, "without --tables or --protocol streets", (*_OF_BOTH, *_OF_CARDS))
-        return evaluate(*sets, config, TerminalReporter(), options.report, write_report, options.overwrite)
+        return evaluate(*sets, config, options.report, write_report, options.overwrite)
     refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model"))
     refuse_to_overwrite(options.report, options.overwrite, ".png")
-    text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model, TerminalReporter())
+    text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model)
     plot = partial(plot_curves, curves, options.report, f"real: {options.reference}") if options.report else None
     return text, values, plot

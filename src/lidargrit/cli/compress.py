@@ -29,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compress the scans, and say how small they are."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.inference.compress.command import compress_scans
 
@@ -37,6 +36,6 @@ def run(options: argparse.Namespace) -> None:
     named = (options.scans, options.out, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
     refuse_other_sensor(settings.sensor, options.model)
-    found = compress_scans(*named, settings.data, TerminalReporter())
+    found = compress_scans(*named, settings.data)
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
     print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

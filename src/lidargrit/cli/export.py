@@ -33,11 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.export import export_scans
     from lidargrit.scans.sensors import load_sensor
 
     sensor = load_sensor(options.sensor) if options.sensor else None
     config = scan_settings(options, max_scans=options.count).data
-    count = export_scans(options.scans, options.out, options.format, config, TerminalReporter(), sensor)
+    count = export_scans(options.scans, options.out, options.format, config, sensor)
     print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

@@ -34,7 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Measure, and print the tables."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.evaluation.likelihood import measure_source
 
@@ -44,4 +43,4 @@ def run(options: argparse.Namespace) -> None:
     named = (options.scans, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
     refuse_other_sensor(settings.sensor, options.model)
-    print_result(options, *measure_source(*named, settings.data, TerminalReporter(), options.map, options.device))
+    print_result(options, *measure_source(*named, settings.data, options.map, options.device))

@@ -31,17 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Prepare, and say what was made."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.prepare import prepare_and_describe
     from lidargrit.data.sources import open_source
-    from lidargrit.data.sources.scan_sensor import sensor_for
 
     refuse_taken(options)
-    reporter, machines = TerminalReporter(), (options.rank, options.world_size)
+    machines = (options.rank, options.world_size)
     settings = scan_settings(options, max_scans=options.count, workers=options.workers)
     source = open_source(options.scans, settings.data.bad_points)
     dataset = source.scans()
-    sensor_for(source, settings.sensor, reporter)
     config = replace(settings.data, sensor=settings.sensor or source.sensor_name)
-    made = prepare_and_describe(options.scans, dataset, config, options.out, reporter, *machines, options.verify)
+    made = prepare_and_describe(options.scans, dataset, config, options.out, *machines, options.verify)
     print_result(options, made.as_text(), made.to_json())

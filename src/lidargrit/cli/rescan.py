@@ -29,17 +29,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many rays of the wanted sensor get a point."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.export import export_scans
     from lidargrit.data.sources import open_source
     from lidargrit.data.sources.scan_sensor import sensor_for
     from lidargrit.scans.rescan import Rescan
     from lidargrit.scans.sensors import load_sensor
 
-    reporter, other = TerminalReporter(), load_sensor(options.to)
+    other = load_sensor(options.to)
     settings = scan_settings(options, max_scans=options.count)
     source = open_source(options.scans, settings.data.bad_points)
-    change = Rescan(sensor_for(source, settings.sensor, reporter), other, options.raised_m)
-    count = export_scans(options.scans, options.out, options.format, settings.data, reporter, change=change)
+    change = Rescan(sensor_for(source, settings.sensor), other, options.raised_m)
+    count = export_scans(options.scans, options.out, options.format, settings.data, change=change)
     look = f"lidargrit view {options.out} --sensor {options.to}"
     print(f"done: {counted_scans(count)} in {options.out}; look at them: {look}")

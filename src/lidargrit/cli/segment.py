@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Label the scans, and say where they are."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.inference.segment.command import segment_scans
 
@@ -40,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     named = (options.scans, options.out, options.model)
     settings = scan_settings(options, max_scans=options.count)
     refuse_other_sensor(settings.sensor, options.model, "segment")
-    count, scores = segment_scans(*named, settings.data, TerminalReporter(), options.device, options.compare)
+    count, scores = segment_scans(*named, settings.data, options.device, options.compare)
     found = scores.as_json() if scores else {}
     done = f"done: {counted_scans(count, 'labelled')} in {options.out}; see them with: lidargrit view {options.out}"
     result = {"source": options.scans, "model": options.model, "scans": count, **found}

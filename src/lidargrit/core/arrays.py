@@ -21,10 +21,6 @@ _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
     """Return the array in the bytes of an .npy file; it shares their memory.
 
-    Args:
-        data: content of a whole .npy file.
-        may_have_fields: whether rows of named numbers are taken as well.
-
     Raises:
         ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
     """
@@ -84,12 +80,6 @@ def read_member(
 ) -> np.ndarray:
     """Unpack one array of an archive.
 
-    Args:
-        archive: archive that :func:`open_archive` opened.
-        info: directory entry of the array.
-        bytes_at_most: largest size of the unpacked .npy, in bytes.
-        may_have_fields: whether rows of named numbers are taken as well.
-
     Raises:
         ValueError: it says that it is larger, is packed by another method than numpy's, or is damaged.
     """
@@ -110,8 +100,6 @@ def read_arrays(
 
     Args:
         file: archive (.npz) that is open for reading, from its first byte to its last.
-        names: names of the wanted arrays, without ``.npy``.
-        bytes_at_most: largest size of each unpacked .npy, in bytes.
 
     Raises:
         ValueError: it is no archive, or a wanted array is too large or damaged.

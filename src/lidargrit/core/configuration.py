@@ -48,9 +48,6 @@ class TypedSettings:
     """Base of settings that users also make in Python, where no parser looks at their types.
 
     A class with further checks calls this one's ``__post_init__`` first.
-
-    Raises:
-        ConfigError: a word that is not among a setting's choices, or a value of another type.
     """
 
     def __post_init__(self) -> None:
@@ -226,17 +223,12 @@ def _parsed(hint: Any, path: str, text: str) -> Any:
 
 
 def _is_numeric(hint: Any) -> bool:
-    """Return whether a type is a number, a tuple of numbers, or one of these or None."""
     parts = [part for part in get_args(hint) if part not in (type(None), Ellipsis)]
     return hint in (int, float) or (get_origin(hint) is not Literal and bool(parts) and all(map(_is_numeric, parts)))
 
 
 def _check_numbers(value: Any, where: str) -> None:
-    """Refuse whole numbers that take more than 64 bits, and numbers that are NaN or infinite.
-
-    Raises:
-        ConfigError: ``where`` names the setting or the file.
-    """
+    """Refuse whole numbers that take more than 64 bits, and numbers that are NaN or infinite."""
     if isinstance(value, (list, tuple)):
         for each in value:
             _check_numbers(each, where)

@@ -71,11 +71,7 @@ def table(kind: str, name: str) -> str:
 
 
 def load_class(kind: str, name: str, base: type[T]) -> type[T]:
-    """Import the one subclass of ``base`` that the file of a name defines.
-
-    Raises:
-        UnknownNameError: no such file; names its nearest neighbours.
-    """
+    """Import the one subclass of ``base`` that the file of a name defines."""
 
     def own_subclass(value: object, module: str) -> type[T] | None:
         if isinstance(value, type) and issubclass(value, base) and value.__module__ == module:
@@ -86,11 +82,7 @@ def load_class(kind: str, name: str, base: type[T]) -> type[T]:
 
 
 def load_instance(kind: str, name: str, base: type[T]) -> T:
-    """Import the object of type ``base`` that a table has under a name, or the one that the file of a name defines.
-
-    Raises:
-        UnknownNameError: no such file or entry; names its nearest neighbours.
-    """
+    """Import the object of type ``base`` that a table has under a name, or the one that the file of a name defines."""
     return _the_one(kind, name, lambda value, _: value if isinstance(value, base) else None)
 
 

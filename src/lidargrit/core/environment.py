@@ -13,9 +13,6 @@ def cache_folder() -> Path:
     """Return the folder of what can be made again: ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache folder.
 
     The user's cache folder is ``$XDG_CACHE_HOME``, else ``~/.cache``.
-
-    Raises:
-        ConfigError: the variable begins with the ``~`` of a user who does not exist.
     """
     return folder_in(CACHE_VARIABLE) or (folder_in("XDG_CACHE_HOME") or Path.home() / ".cache") / "lidargrit"
 
@@ -24,9 +21,6 @@ def folder_in(variable: str) -> Path | None:
     """Return the folder that an environment variable names, as an absolute path; None if it is empty or not set.
 
     ``~`` is the user's home, and a relative path counts from the folder in which this process first asked for it.
-
-    Raises:
-        ConfigError: it begins with the ``~`` of a user who does not exist.
     """
     text = os.environ.get(variable, "")
     try:

@@ -227,11 +227,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file that a user named, of at most :data:`lidargrit.core.untrusted.TEXT_BYTES_AT_MOST` bytes.
-
-    Raises:
-        ConfigError: it is missing, too large or not text.
-    """
+    """Read a text file that a user named, of at most :data:`lidargrit.core.untrusted.TEXT_BYTES_AT_MOST` bytes."""
     wanted, cure = "a text file in UTF-8", "check the path"
     try:
         return _read_bytes(path, ConfigError, wanted, cure, TEXT_BYTES_AT_MOST).decode("utf-8")
@@ -281,9 +277,6 @@ def read_json(
     """Read a JSON file of bounded size and depth; a pipe or a device is refused.
 
     The arguments are those of :func:`lidargrit.core.untrusted.parse_json`.
-
-    Raises:
-        LidarGritError: the file is missing or cannot be used; of the class ``error``.
     """
     data = _read_bytes(path, error, wanted, cure, at_most)
     return parse_json(data, str(path), kind, error, wanted, cure, at_most)
@@ -334,11 +327,7 @@ def write_tensors(path: Path, tensors: "Mapping[str, Tensor]", about: Mapping[st
 
 
 def read_tensors(path: Path) -> "tuple[dict[str, Tensor], dict[str, Any]]":
-    """Read tensors and what is known about them from a safetensors file.
-
-    Raises:
-        CheckpointError: the file is missing, may not be read, is cut short, or is not one of ours.
-    """
+    """Read tensors and what is known about them from a safetensors file."""
     from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
 
     from safetensors import SafetensorError  # noqa: PLC0415

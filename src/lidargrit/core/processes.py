@@ -25,9 +25,6 @@ def rank_and_world_size(rank: int | None = None, world_size: int | None = None) 
 
     A number that is not given comes from ``RANK`` and ``WORLD_SIZE``, which launchers such as torchrun set. Without
     these, this process is alone: number 0 of 1.
-
-    Raises:
-        ConfigError: the numbers contradict each other.
     """
     rank, world_size = _from_environment("RANK", rank, 0), _from_environment("WORLD_SIZE", world_size, 1)
     if not 0 <= rank < world_size:
@@ -40,10 +37,6 @@ def module_command(module: str, *words: str) -> list[str]:
 
     The option is ``-P`` and not ``-I``: the latter would also ignore ``PYTHONPATH`` and packages that are installed
     for one user only, and so lose lidargrit itself where it is found by them.
-
-    Args:
-        module: name of the module.
-        words: arguments of the module.
 
     Example:
         >>> module_command("lidargrit.data.prepared", "folder")[1:]
@@ -66,14 +59,6 @@ def process_pool(count: int, begin: Callable[[], None] | None = None) -> Iterato
 
     If the block fails or is interrupted, they are terminated. If this process is killed, they end by themselves: they
     would else go on to write into a folder that nobody holds any more.
-
-    Args:
-        count: largest number of processes.
-        begin: function that each process calls first.
-
-    Raises:
-        ConfigError: less than one process, or more than :data:`PROCESSES_AT_MOST`.
-        DataError: one of them died.
     """
     check_processes(count)
     before = {*active_children()}

@@ -37,13 +37,9 @@ def parse_json(
     """Parse JSON of bounded size and depth.
 
     Args:
-        data: JSON in UTF-8.
         source: name of the file or message, for the error.
-        kind: required type of the whole, dict or list.
-        error: class of the error that is raised.
         wanted: description of valid content, for the error.
         cure: advice to the user, for the error.
-        at_most: largest size, in bytes.
 
     Raises:
         LidarGritError: it is too large, too deep, not JSON, not of this type, or holds NaN or a number that no float
@@ -88,11 +84,7 @@ def check_word(word: str) -> str:
 
 
 def check_path(word: str) -> Path:
-    """Return a path that the file system can hold.
-
-    Raises:
-        UsageError: as :func:`check_word`, or the word is empty, or a name in it is too long.
-    """
+    """Return a path that the file system can hold."""
     check_word(word)
     if not word.strip():
         raise UsageError(repr(word), "the name of a file or folder", "write one")
@@ -107,11 +99,7 @@ def check_path(word: str) -> Path:
 
 
 def user_path(text: str, error: type[LidarGritError] = DataError) -> Path:
-    """Return a path with ``~`` and ``~user`` replaced by home folders.
-
-    Raises:
-        LidarGritError: there is no such user, or no file can be called so; of the class ``error``.
-    """
+    """Return a path with ``~`` and ``~user`` replaced by home folders."""
     try:
         return check_path(text).expanduser()
     except RuntimeError:  # what pathlib raises
@@ -121,11 +109,7 @@ def user_path(text: str, error: type[LidarGritError] = DataError) -> Path:
 
 
 def whole_number(word: str, at_most: int = COUNT_AT_MOST) -> int:
-    """Return a whole number from 0 on.
-
-    Raises:
-        UsageError: the word is no whole number, or it is negative or too large.
-    """
+    """Return a whole number from 0 on."""
     try:
         value = int(word) if len(word) <= 40 else -1  # Python needs quadratic time for long ones
     except ValueError:
@@ -141,11 +125,7 @@ def seed_number(word: str) -> int:
 
 
 def seeds_in_a_row(first: int, count: int) -> range:
-    """Return the seeds of a number of scans from a first one on, the next scan with the next seed.
-
-    Raises:
-        UsageError: no scan, or the last seed is above :data:`SEED_AT_MOST`.
-    """
+    """Return the seeds of a number of scans from a first one on, the next scan with the next seed."""
     if count < 1:
         raise UsageError(f"-n {count}", "at least one scan", "raise it")
     if first + count - 1 > SEED_AT_MOST:
@@ -160,11 +140,7 @@ def is_temperature(value: float) -> bool:
 
 
 def positive_number(word: str) -> float:
-    """Return a number from 0 on that is neither NaN nor infinite.
-
-    Raises:
-        UsageError: the word is no number, or it is negative or too large.
-    """
+    """Return a number from 0 on that is neither NaN nor infinite."""
     try:
         value = float(word)
     except ValueError:

@@ -5,10 +5,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidargrit.core import discovery
+from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, nearest_names, one_of
 from lidargrit.core.files import refuse_to_overwrite
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, SampleSource, Source, TensorSource, open_source
@@ -27,7 +26,6 @@ def evaluate(
     samples: str,
     reference: str,
     config: EvalConfig,
-    reporter: Reporter,
     report: Path | None = None,
     write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
     overwrite: bool = False,
@@ -63,10 +61,10 @@ def evaluate(
             f"lidargrit sample {samples} FOLDER, or lidargrit likelihood {reference} --model {samples}",
         )
     _refuse_unused(first, config)
-    pair = open_pair(first, second, config, reporter)
-    card = compare_pair(pair, config, reporter)
+    pair = open_pair(first, second, config)
+    card = compare_pair(pair, config)
     for warning in card.warnings[len(pair.warnings) :]:
-        reporter.message(f"WARNING: {warning}")
+        reporting.message(f"WARNING: {warning}")
     also = partial(write_report, card, pair, report) if report and write_report else None
     return card.as_table(), card.to_json(), also
 
@@ -81,7 +79,7 @@ def streets_of(samples: str, config: EvalConfig) -> Streets | None:
 
 
 def evaluate_streets(
-    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str, reporter: Reporter
+    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str
 ) -> tuple[str, dict[str, Any], list[CurveScore]]:
     """Compare simulated streets, and independent drops of their clean scans, with real scans.
 
@@ -100,7 +98,7 @@ def evaluate_streets(
     """
     drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
     simulated, real = scans_of_both(
-        streets, open_source(reference, config.data.bad_points), config.sensor, config.data_config(), reporter
+        streets, open_source(reference, config.data.bad_points), config.sensor, config.data_config()
     )
     of_model = scores_of_model(drops, simulated, real) if drops else []
     scores = compare(simulated, real)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -126,7 +126,7 @@ def drop_independently(clean: RangeImage, return_share: float) -> RangeImage:
 
 
 def scans_of_both(
-    streets: Streets, source: Source, sensor: str, config: DataConfig, reporter: Reporter
+    streets: Streets, source: Source, sensor: str, config: DataConfig
 ) -> tuple[SimulatedScans, RangeImages]:
     """Simulate scans, and open the real scans that they are compared with.
 
@@ -148,10 +148,10 @@ def scans_of_both(
     if "@" in str(streets.root) and not streets.made_by.same_rays(firing):
         got = f"streets of {streets.made_by.name!r} and scans of {firing.name!r}"
         raise ConfigError(got, "one sensor", "leave @SENSOR out: streets are scanned as the scans were")
-    real = source.images(config.imaged(firing), replace(config, max_scans=len(seeds)), reporter)
+    real = source.images(config.imaged(firing), replace(config, max_scans=len(seeds)))
     _require_two(real)
     pairs = []
-    with reporter.progress("simulating", len(seeds)) as progress:
+    with reporting.progress("simulating", len(seeds)) as progress:
         for seed in seeds:
             pairs.append(simulate_pair(seed, real.sensor, firing))
             progress.advance(1)

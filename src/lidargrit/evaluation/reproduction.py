@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.evaluation.benchmark import Benchmark
@@ -163,7 +162,7 @@ class Reproduction:
         return f"{self.table.data_set}:{self.root}:{split}"
 
 
-def prepare(benchmark: Benchmark, systems: Sequence[str], reporter: Reporter) -> None:
+def prepare(benchmark: Benchmark, systems: Sequence[str]) -> None:
     """Project all training scans before anything is trained: one that cannot be used is refused now, not after days.
 
     Raises:
@@ -172,8 +171,8 @@ def prepare(benchmark: Benchmark, systems: Sequence[str], reporter: Reporter) ->
     """
     open_source(benchmark.reference)  # refuses a split that is not there
     for data in [benchmark.preset(system).data for system in systems]:
-        load_range_images(data.train, data, reporter)
-        load_range_images(data.val, data, reporter)
+        load_range_images(data.train, data)
+        load_range_images(data.val, data)
 
 
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:

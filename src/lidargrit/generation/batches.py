@@ -95,12 +95,7 @@ def check_images(images: RangeImage | Observed, sensor: SensorModel) -> None:
 
 
 def check_observed(condition: Observed, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
-    """Refuse observations of other rays, and those of a kind that a generator does not take.
-
-    Args:
-        kinds: kinds that the generator takes.
-        name: name of the generator, for the message.
-    """
+    """Refuse observations of other rays, and those of a kind that a generator does not take."""
     check_images(condition, sensor)
     if not condition.kinds <= set(kinds):
         raise ConfigError(

@@ -56,7 +56,6 @@ class SystemFacts:
         """Return the facts as lines for a person, what a generator can do between them, and its settings behind them.
 
         Args:
-            capabilities: names of what the generator can do besides sampling.
             sampling: settings of sampling with their defaults, by their names.
             not_of_sampling: names of those settings that only completing or inverting a scan reads.
         """

@@ -266,11 +266,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         raise NotImplementedError
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:
-        """Encode and decode a batch of one scan."""
         raise NotImplementedError
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
-        """Return the bits of a batch of one scan."""
         raise NotImplementedError
 
     def _check_condition(self, condition: Condition) -> None:

@@ -140,9 +140,6 @@ def preset(
     """Return a preset of the system whose configuration the model is.
 
     Args:
-        title: description in one line.
-        data: settings of the data.
-        model: configuration of one of the systems.
         published: scores that a paper reports.
         stages_from: run whose stages are taken.
         fine_tune: names of stages that are trained further.
@@ -156,8 +153,6 @@ def variant(title: str, base: Preset, settings: Mapping[str, Any]) -> Preset:
     """Return a preset that differs from another by its title and by the settings named.
 
     Args:
-        title: description in one line.
-        base: preset that it differs from.
         settings: other values, by the dotted names of settings or parts.
     """
     return configuration.changed(base, {"title": title, **settings})

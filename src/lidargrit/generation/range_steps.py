@@ -21,9 +21,6 @@ class RangeSteps:
 
     Multiple k stands for all ranges that are nearer to it than to another one, between the limits of the sensor: the
     first and the last interval end there.
-
-    Raises:
-        ConfigError: a step that is no whole number of millimetres from 1 to 1000.
     """
 
     sensor: SensorModel
@@ -62,11 +59,7 @@ class RangeSteps:
         return low, torch.where(indices >= self.last, self.sensor.range_max_m, high)
 
     def round(self, images: RangeImage) -> RangeImage:
-        """Return images whose ranges are whole multiples of the step.
-
-        Raises:
-            ConfigError: a return nearer or farther than the sensor's limits, by more than half a step.
-        """
+        """Return images whose ranges are whole multiples of the step."""
         slack_m = self.step_mm / 2000
         near_m, far_m = self.sensor.range_min_m - slack_m, self.sensor.range_max_m + slack_m
         if bool((images.return_mask & ((images.range_m < near_m) | (images.range_m > far_m))).any()):

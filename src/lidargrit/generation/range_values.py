@@ -17,9 +17,6 @@ def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W
 
     The shortest range of a return lies above -1: at -0.59 for 1.45 m of 80 m. Between the two is nothing, which is how
     the published models of R2DM and R2Flow tell a return from none.
-
-    Raises:
-        ConfigError: a single image, or images without the reflectance that is to be learned.
     """
     if images.range_m.ndim != 3:
         raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")

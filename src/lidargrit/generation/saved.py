@@ -41,9 +41,6 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         Args:
             bits: bits of a parameter; a network that reads them computes in 32 bits as before. With 8, matrices and
                 kernels are quantized, and vectors such as biases have 16 bits. Buffers are saved as they are.
-
-        Raises:
-            ConfigError: a parameter is beyond what 16 bits hold, and not to be stored in 32.
         """
         named = {} if bits == 32 else {name: each.detach() for name, each in self.named_parameters()}
         halved = {name: each.half() for name, each in named.items()}
@@ -68,11 +65,7 @@ class SavedModel(nn.Module, Generic[ConfigT]):
     def from_weights(
         cls: type[ModelT], config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path
     ) -> ModelT:
-        """Make a generator with given weights.
-
-        Raises:
-            CheckpointError: weights of another configuration.
-        """
+        """Make a generator with given weights."""
         generator = cls(config, sensor)
         load_exactly(generator, weights, source)
         return generator.eval()
@@ -96,12 +89,7 @@ def download(name: str, revision: str | None, patterns: list[str]) -> Path:
     """Download files of a repository by the hub's own client, which keeps them in its cache.
 
     Args:
-        name: name of the repository, "USER/REPOSITORY".
-        revision: branch, tag or commit; None for the repository's main branch.
         patterns: names of the files wanted, of which ``*`` stands for any letters.
-
-    Raises:
-        CheckpointError: no name of a repository, no such repository, no connection, or no client installed.
     """
     wanted, cure = "a run's folder, or USER/REPOSITORY on the Hugging Face hub", "check the name"
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
@@ -121,9 +109,6 @@ def read_saved(folder: Path, class_of: Callable[[str], type[ModelT]]) -> ModelT:
 
     Args:
         class_of: function from the name of a system to its class.
-
-    Raises:
-        CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
     """
     saved = read_config(folder)
     with told_of(folder / CONFIG_FILE):

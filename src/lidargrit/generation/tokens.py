@@ -151,7 +151,6 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             tokens: tokens of ``compute_batch`` scans in raster order.
             wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
             mask: method by which returns and ranges are decided, checked by :meth:`check_choice`.
-            pixels: settings by which the pixel decoder samples masks and ranges.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
             condition: observed part of the scans, which a pixel decoder keeps.
         """

@@ -25,13 +25,6 @@ def attend(
     There, products are computed block by block of queries, with scores in 16 bits, and sums of the softmax in 32:
     more than twice as fast for 256 tokens, forward and backward, and 1.2 to 1.8 times for 1,024 (measured in
     ``benchmarks/attention.py``).
-
-    Args:
-        query: queries of each head.
-        key: keys of each head.
-        value: values of each head.
-        causal: whether a token attends only to itself and to those before it.
-        dropout: probability of dropout on attention weights.
     """
     length = query.shape[-2]
     if query.dtype != torch.bfloat16 or query.device.type != "cpu" or length > _KEYS_AT_MOST or dropout:

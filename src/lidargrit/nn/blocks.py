@@ -34,9 +34,6 @@ def prepare_for_training(objective: nn.Module, recompute: bool, compiled: bool) 
         recompute: whether every block drops its activations and computes them again for the gradients, which stay the
             same, dropout included.
         compiled: whether every network is compiled when it is first called.
-
-    Raises:
-        ConfigError: the objective has no block to recompute, or no network to compile.
     """
     for block in _parts(objective, Block, "recompute", recompute):
         block.recomputed = recompute  # a stage before may have trained the same network otherwise

@@ -40,9 +40,6 @@ class CachedDecoder:
             default only on a GPU.
         guidance: weight w of logits weaker + w (own - weaker), where the weaker ones are those of the same transformer
             without the attention of its last block but one, or of its only one; 1 gives the transformer's own logits.
-
-    Raises:
-        ConfigError: 8 bits on a device that is not a CPU.
     """
 
     def __init__(

@@ -6,11 +6,7 @@ from lidargrit.core.errors import ConfigError
 
 
 def usable_device(name: str) -> torch.device:
-    """Return a device by its name, such as "cpu" or "cuda"; with "", a GPU if there is one, and else the CPU.
-
-    Raises:
-        ConfigError: no such device here.
-    """
+    """Return a device by its name, such as "cpu" or "cuda"; with "", a GPU if there is one, and else the CPU."""
     name = name or ("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)

@@ -14,7 +14,6 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: Path) ->
 
     Args:
         module: module that gets the weights; it stays as it is if they are refused.
-        source: file that they were read from.
 
     Raises:
         CheckpointError: a name, a size or a kind of number differs, or a parameter is not finite; names the first.

@@ -33,7 +33,6 @@ def sample_from_all(rows: Float[Tensor, "n D"], count: int, rng: torch.Generator
 
     Args:
         rows: rows of this process; every process has equally many.
-        count: number of rows to sample.
         rng: source of random numbers; that of the first process counts. None for torch's own.
     """
     if not _several():

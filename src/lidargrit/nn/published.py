@@ -27,11 +27,6 @@ def read_checkpoint(
 
     Args:
         names: names that lead to the weights, such as ``("G_ema",)``; nothing else in the file is read.
-        bytes_at_most: largest size of the file in bytes; a larger one is refused unread.
-        ignored: patterns of names that are skipped, such as ``loss.*``.
-
-    Raises:
-        CheckpointError: no file, too large a one, or anything but float32 tensors under these names.
     """
     try:
         found = read_everything(path, bytes_at_most)
@@ -81,11 +76,7 @@ def unpickle(data: bytes) -> Any:
 
 
 def float_tensors(loaded: object, bytes_at_most: int) -> dict[str, Tensor]:
-    """Return float32 tensors by their names, in memory of their own, without the counters that training keeps.
-
-    Raises:
-        RefusedFileError: anything else was loaded, or a tensor is larger than the limit.
-    """
+    """Return float32 tensors by their names, in memory of their own, without the counters that training keeps."""
     if not isinstance(loaded, dict) or not all(isinstance(name, str) for name in loaded):
         raise RefusedFileError("which holds no tensors by name")
     tensors = {name: value for name, value in loaded.items() if not name.endswith("num_batches_tracked")}

@@ -36,11 +36,6 @@ def numbers_at_most(
 
     Args:
         count: largest number of weights and buffer elements of all modules that are built in the block.
-        what: name of the network, for the message of an error.
-        cure: advice to the user, for the same message.
-
-    Raises:
-        ConfigError: there are more, or the system has no memory for one of them.
     """
     found, own = 0, threading.get_ident()  # the hooks see the networks of all threads
 

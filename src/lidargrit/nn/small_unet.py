@@ -17,13 +17,7 @@ _CELL = 8  # rows and columns of an image are multiples of it
 
 
 def check_size(rows: int, columns: int, wanted_by: str) -> None:
-    """Refuse images that cannot be halved three times, with ConfigError.
-
-    Args:
-        rows: rows of an image.
-        columns: columns of an image.
-        wanted_by: name of the network, for the message.
-    """
+    """Refuse images that cannot be halved three times, with ConfigError."""
     if rows % _CELL or columns % _CELL:
         raise ConfigError(
             f"range images of {rows}x{columns} for {wanted_by}",
@@ -102,7 +96,6 @@ class SmallUnet(Network):
         """Return the output at full size, and the further ones by the name of their part.
 
         Args:
-            maps: input at full size.
             more: further inputs by the name of their part.
         """
         entered = self.enter(F.pixel_unshuffle(maps, 2))

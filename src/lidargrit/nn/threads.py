@@ -16,9 +16,6 @@ def threads_for(step_flops: int) -> Iterator[None]:
     Beside other work a thread that spins takes the processor from the very thread that it waits for, a hundred times a
     step. The command ``lidargrit`` lets threads sleep; other programs that load torch mostly do not, and OpenMP reads
     its variables only once.
-
-    Args:
-        step_flops: floating-point operations of one step.
     """
     threads = torch.get_num_threads()
     sleeps = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"

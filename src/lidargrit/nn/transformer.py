@@ -145,8 +145,6 @@ def resample_positions(
 
     Args:
         positions: learned positions, row by row.
-        grid: rows and columns of the grid that they were learned for.
-        columns: columns of the new grid.
     """
     rows, old = grid
     at = (torch.arange(columns, dtype=torch.float64) + 0.5) * old / columns - 0.5  # centres of the new columns

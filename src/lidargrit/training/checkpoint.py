@@ -25,9 +25,6 @@ def save_checkpoint(
     """Write everything that the next step depends on, atomically: an interrupted save leaves the older checkpoint.
 
     Args:
-        average: moving average of its weights.
-        optimiser: optimiser with its moments.
-        scans_seen: number of training scans seen so far, over all processes.
         built_on: fingerprint of the earlier stage's weights; "" for the first stage.
     """
     tensors: dict[str, Tensor] = {}
@@ -41,11 +38,7 @@ def save_checkpoint(
 def load_checkpoint(
     path: Path, objective: nn.Module, average: WeightAverage, optimiser: torch.optim.Optimizer, built_on: str
 ) -> int:
-    """Load what :func:`save_checkpoint` wrote and return the scans seen.
-
-    Raises:
-        CheckpointError: the file is damaged, of another configuration, or of a stage that was built on other weights.
-    """
+    """Load what :func:`save_checkpoint` wrote and return the scans seen."""
     tensors, about = read_tensors(path)
     if about.get("built_on") != built_on:
         raise CheckpointError(
@@ -71,16 +64,11 @@ def load_checkpoint(
 
 
 def load_average(path: Path, objective: nn.Module) -> None:
-    """Load the averaged weights of a checkpoint, with all that a finished generator does not keep of its objective.
-
-    Raises:
-        CheckpointError: the file is damaged, or of another configuration.
-    """
+    """Load the averaged weights of a checkpoint, with all that a finished generator does not keep of its objective."""
     load_exactly(objective, weights_below(read_tensors(path)[0], "average."), path)
 
 
 def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
-    """Return the state of each weight by the weight's number."""
     state: dict[int, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         index, _, key = name.partition(".")

@@ -66,10 +66,6 @@ def training_flops(preset: Preset, taken: Collection[str] | None = None) -> dict
 
     Returns:
         number of operations, by the name of the stage; none for stages that are taken from another run.
-
-    Raises:
-        ConfigError: a stage without settings of its training.
-        CheckpointError: no finished run to take stages from.
     """
     return {name: cost.flops(preset.settings_of(name).scans) for name, cost in stage_costs(preset, taken).items()}
 
@@ -93,10 +89,6 @@ def stage_costs(preset: Preset, taken: Collection[str] | None = None) -> dict[st
 
 def computing_time(flops: int, precision: Precision) -> str:
     """Return a line for a person: operations, and estimated times on this machine's CPU and, for many, on a GPU.
-
-    Args:
-        flops: number of floating-point operations.
-        precision: precision of the operations.
 
     Source:
         Peaks of an NVIDIA A100 without sparsity: its datasheet, 2021.
@@ -142,9 +134,6 @@ def with_budget(preset: Preset, flops: float) -> Preset:
 
     Args:
         flops: number of floating-point operations that the training may take.
-
-    Raises:
-        ConfigError: the budget is smaller than one batch of every stage, or a stage has no settings of its training.
     """
     if not preset.training:
         return preset
@@ -231,7 +220,6 @@ def _cost_with_values(preset: Preset, generator: Generator, stage: str, sensor: 
 
 
 def _cost(objective: Objective, example: Example, make_rng: Callable[[], torch.Generator]) -> StageCost:
-    """Count the operations of some steps of all players."""
     steps = min(objective.period, _STEPS_AT_MOST)
     objective.train()
     with FlopCounter() as counter, warnings.catch_warnings():

@@ -76,11 +76,7 @@ class Engine:
 
     @contextmanager
     def lost_processes_reported(self) -> Iterator[None]:
-        """Report in one line that another process has died, whatever the library of the connection prints.
-
-        Raises:
-            TrainingError: another process does not answer any more.
-        """
+        """Report in one line that another process has died, whatever the library of the connection prints."""
         try:
             yield
         except RuntimeError as error:  # NCCL has a class of its own for it, gloo has not
@@ -113,9 +109,6 @@ class Engine:
         If a loss or a gradient is not finite in any process, no process changes its weights.
 
         Args:
-            example: this process's share of a batch.
-            seed: seed of the objective's random numbers.
-            gradient_clip: largest norm of the gradient; 0 for no limit.
             parts: number of parts of the share whose gradients are computed one after the other and added up.
         """
         self._objective.train()

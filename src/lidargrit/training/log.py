@@ -47,17 +47,7 @@ class Log:
             self._trim()
 
     def write(self, split: str, scans_seen: int, seconds: float, terms: dict[str, float]) -> None:
-        """Add an entry.
-
-        Args:
-            split: ``train`` or ``val``.
-            scans_seen: number of training scans seen so far, over all processes.
-            seconds: time since the start or the resumption of the stage, in seconds.
-            terms: values of the loss terms, by name.
-
-        Raises:
-            OutputError: the log cannot be written.
-        """
+        """Add an entry."""
         line = {"scans_seen": scans_seen, "split": split, "seconds": round(seconds, 1), **terms}
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)

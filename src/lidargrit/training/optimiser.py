@@ -18,9 +18,6 @@ def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.
     """Return the optimiser that the configuration names.
 
     Weights of linear layers decay; biases, norms, convolutions and embeddings do not.
-
-    Raises:
-        ConfigError: Muon is asked for, and no block of the networks has a linear layer.
     """
     learned = [parameter for parameter in objective.parameters() if parameter.requires_grad]
     decaying = _ids_of_linear_weights(objective)

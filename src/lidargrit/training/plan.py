@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lidargrit.core import configuration
+from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import DatasetSource, PreparedSource, open_to_train
@@ -106,15 +106,12 @@ class OpenedData:
 
 
 def open_data(preset: Preset) -> OpenedData:
-    """Open the sources of training and validation scans, as far as they can be checked before a scan is read.
-
-    Raises:
-        DataError: a source that is not there, holds no scans, or was prepared for another sensor or projection.
-    """
+    """Open the sources of training and validation scans, as far as they can be checked before a scan is read."""
     opened = OpenedData(open_to_train(preset.data.train, preset.data), open_to_train(preset.data.val, preset.data))
     for source in (*opened.train, *opened.val):
         if isinstance(source, PreparedSource):
-            source.images(preset.data.load_sensor(), preset.data)
+            with reporting.to(reporting.Reporter()):  # training says it when it opens them
+                source.images(preset.data.load_sensor(), preset.data)
     return opened
 
 
@@ -154,16 +151,7 @@ class CheckedStages:
 
 
 def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
-    """Refuse settings of any stage that its training would refuse, and stages to take that do not fit.
-
-    Args:
-        processes: number of processes that share each batch.
-
-    Raises:
-        ConfigError: a stage without settings of its training, settings that its networks cannot follow, or a stage to
-            take from another run that does not fit.
-        CheckpointError: no finished run to take stages from.
-    """
+    """Refuse settings of any stage that its training would refuse, and stages to take that do not fit."""
     sensor = preset.data.load_sensor()
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = preset.build_generator(sensor).to("meta")

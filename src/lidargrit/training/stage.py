@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, evenly_spaced
 from lidargrit.core.errors import ConfigError, Terminated, TrainingError
 from lidargrit.core.files import remove_partials
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import CHECKPOINT_FILE
@@ -52,7 +52,6 @@ class StageTraining:
     config: TrainingConfig
     folder: Path
     seed: int
-    reporter: Reporter
     built_on: str = ""
     workers: int = 1
     condition: ToldOfScans = field(default_factory=NothingTold)
@@ -84,11 +83,6 @@ class StageTraining:
     def run(self, train: RangeImages, val: RangeImages, what: str) -> Objective:
         """Train until all scans of the budget are seen, and return the objective with its averaged weights.
 
-        Args:
-            train: range images to learn from.
-            val: range images for validation.
-            what: text beside the progress bar.
-
         Raises:
             TrainingError: the loss is not finite; names the scans seen and the last good checkpoint.
             OutputError: a checkpoint could not be written; the one before it is intact.
@@ -107,7 +101,7 @@ class StageTraining:
             self.condition.of,
         )
         begun = time.monotonic()
-        progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
+        progress_bar = reporting.progress(what, config.scans, self.scans_seen)
         with Termination(self.deadline_s) as termination, progress_bar as progress:
             if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
                 self._log_terms("val", self.validate(val, termination), 0.0)
@@ -199,17 +193,13 @@ class StageTraining:
         self.engine.by_first(lambda: self.log.write(split, self.scans_seen, seconds, terms))
         if split == "val":
             losses = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
-            self.reporter.message(f"  after {self.scans_seen} scans, on val: {losses}")
+            reporting.message(f"  after {self.scans_seen} scans, on val: {losses}")
             for warning in self.objective.warnings():
-                self.reporter.message(f"  WARNING: {warning}")
+                reporting.message(f"  WARNING: {warning}")
 
 
 def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine, torch.optim.Optimizer]:
-    """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser.
-
-    Raises:
-        ConfigError: settings that the objective's networks or the processes cannot follow.
-    """
+    """Return the engine that a stage is trained with, which holds the objective from now on, and the optimiser."""
     engine = Engine(config.precision, objective.reaches_all_weights and not objective.players)
     optimiser = follow_settings(objective, config, engine.world_size)
     engine.set_up(objective, optimiser)
@@ -217,15 +207,7 @@ def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine
 
 
 def follow_settings(objective: Objective, config: TrainingConfig, processes: int) -> torch.optim.Optimizer:
-    """Set an objective's networks as the settings of its training say, and return the optimiser.
-
-    Args:
-        processes: number of processes that share each batch.
-
-    Raises:
-        ConfigError: a process cannot divide its share of a batch into the parts asked for, or the networks lack what
-            is to be recomputed, compiled or trained by Muon.
-    """
+    """Set an objective's networks as the settings of its training say, and return the optimiser."""
     _check_parts(objective, config, processes)
     if config.compile:
         _check_compiler()

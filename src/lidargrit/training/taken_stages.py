@@ -25,9 +25,6 @@ def donors_of_stages(preset: Preset, stages: Sequence[str]) -> dict[str, str]:
 
     Args:
         stages: names of the stages of the preset's generator.
-
-    Raises:
-        CheckpointError: no finished run to take stages from.
     """
     if preset.tokenizer_from is not None:
         return {"tokenizer": preset.tokenizer_from}
@@ -65,11 +62,6 @@ def taken_stages(preset: Preset, generator: Generator) -> dict[str, Objective]:
     Those that the preset names in ``fine_tune`` are among them: their training starts from these weights. They may
     lack what :attr:`Objective.additions` add, which begins untrained, and may be of another sensor if its weights fit.
     The run may be of another generator if what they share learns by the same objective.
-
-    Raises:
-        ConfigError: a stage of other sizes or another objective, a stage that is not trained of another sensor, or a
-            run of a generator without any of the preset's stages.
-        CheckpointError: no finished run.
     """
     if preset.tokenizer_from is not None:
         if "tokenizer" not in generator.stages:
@@ -135,11 +127,7 @@ class _Stage:
 
 
 def _restore(run: str, stage: _Stage) -> None:
-    """Give an objective what a finished generator does not keep of it, such as a discriminator, where the run has it.
-
-    Raises:
-        ConfigError: an adversarial stage without its checkpoint, whose discriminator would be an untrained one.
-    """
+    """Give an objective what a finished generator does not keep, such as a discriminator, where the run has it."""
     checkpoint = locate(run) / stage.name / CHECKPOINT_FILE
     if checkpoint.is_file():
         load_average(checkpoint, stage.objective)

@@ -18,10 +18,6 @@ def tracked(project: str, preset: Preset, folder: Path) -> Iterator[None]:
 
     Args:
         project: name of the project; "" to send nothing.
-        preset: preset of the run, whose settings are sent.
-
-    Raises:
-        ConfigError: the package wandb is missing, or the service refuses.
     """
     if not project or rank_and_world_size(None, None)[0] > 0:  # of several processes the first one logs
         yield

@@ -1,19 +1,15 @@
 """A source and the sensor that a user named → the sensor whose rays its scans lie on."""
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import Job, locate
 from lidargrit.data.sources import RunSource
 from lidargrit.data.sources.source import Source
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
-def sensor_for(source: Source, name: str, reporter: Reporter) -> SensorModel:
-    """Return the sensor of a name or a ``.json`` file, else that of a source, and tell if this one was guessed."""
-    sensor = load_sensor(name) if name else source.sensor
-    if source.guess:
-        reporter.message(source.guess)
-    return sensor
+def sensor_for(source: Source, name: str) -> SensorModel:
+    """Return the sensor of a name or a ``.json`` file, else that of a source."""
+    return load_sensor(name) if name else source.sensor
 
 
 def refuse_other_sensor(name: str, model: str, job: Job = "sample") -> None:

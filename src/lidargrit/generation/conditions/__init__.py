@@ -16,11 +16,7 @@ class ToldOfScans(ABC):
 
     @abstractmethod
     def of(self, images: RangeImage) -> Condition:
-        """Return what a generator is told of each image.
-
-        Raises:
-            ConfigError: images that lack what tells it.
-        """
+        """Return what a generator is told of each image."""
 
 
 def load(name: str) -> ToldOfScans:

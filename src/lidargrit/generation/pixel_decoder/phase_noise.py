@@ -50,7 +50,6 @@ class PhaseNoise(nn.Module):
         """Take in the residuals of true masks.
 
         Args:
-            phases: phases of one lattice.
             logits: logits of the probability of a return, given the earlier phases; infinite for pixels to leave out.
             returned: True where a pixel returned.
         """

@@ -119,11 +119,7 @@ class Guide(NamedTuple):
 
     @classmethod
     def of(cls, decoded: Decoded) -> "Guide":
-        """Return the guide from the output of the tokenizer's decoder.
-
-        Raises:
-            ConfigError: a tokenizer whose decoder gives no features.
-        """
+        """Return the guide from the output of the tokenizer's decoder."""
         if decoded.features is None:
             raise ConfigError(
                 "a tokenizer whose decoder gives no features",

@@ -106,9 +106,6 @@ def phases_of(coarsest_cell: int, column_halvings: int = 0, row_halvings: int = 
             the cells have as many columns as rows, times 2 for each.
         row_halvings: number of halvings of the distance between rows alone, likewise: the cells have as many rows as
             columns, times 2 for each. It is 0 if ``column_halvings`` is not.
-
-    Raises:
-        ConfigError: a cell of another size, or halvings of both.
     """
     if coarsest_cell < 2 or coarsest_cell & (coarsest_cell - 1):
         raise ConfigError(f"coarsest_cell={coarsest_cell}", "a power of 2, at least 2", "e.g. 8")
@@ -147,12 +144,7 @@ def one_of_phases(phases: list[Phase], rng: torch.Generator) -> list[Phase]:
 
 
 def generated_before(phases: Sequence[Phase], like: Float[Tensor, "*shape"]) -> Float[Tensor, "P 1 4 1 1"]:
-    """Return 1 for those of the 2x2 pixels, row by row, that are generated before each phase's, and 0 for others.
-
-    Args:
-        phases: phases of one lattice.
-        like: tensor whose number type and device the result has.
-    """
+    """Return 1 for those of the 2x2 pixels, row by row, that are generated before each phase's, and 0 for others."""
     pixels = [(row, column) for row in (0, 1) for column in (0, 1)]
     before = [[pixel in phase.lattice.order[: phase.rank] for pixel in pixels] for phase in phases]
     return torch.tensor(before, dtype=like.dtype, device=like.device)[:, None, :, None, None]
@@ -190,12 +182,7 @@ def pixels_around(
 
 
 def plane_weights(phase: Phase, elevation_rad: Float[Tensor, "H"]) -> Float[Tensor, "h 1 2"]:
-    """Return for each row of a phase the weights of 1 / range in the row above and in the row below, on a plane.
-
-    Args:
-        phase: phase whose pixels are interpolated.
-        elevation_rad: elevation of the image's rows in radians.
-    """
+    """Return for each row of a phase the weights of 1 / range in the row above and in the row below, on a plane."""
     height = len(elevation_rad)
     rows = torch.arange(height, device=elevation_rad.device)[phase.pixels[0]]
     above, below = rows - phase.lattice.rows, rows + phase.lattice.rows

@@ -16,11 +16,7 @@ from lidargrit.scans.types import RangeImage
 
 
 def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int, norm_groups: int = 32) -> None:
-    """Refuse sizes of which no network can be built.
-
-    Raises:
-        ConfigError: channels that the norms' groups do not divide, or a number out of bounds.
-    """
+    """Refuse sizes of which no network can be built."""
     if norm_groups < 1:
         raise ConfigError(f"norm_groups={norm_groups}", "at least 1", "32 are published")
     if channels < 1 or channels % norm_groups:
@@ -111,11 +107,7 @@ class ConvolutionalTokenizer(CodebookTokenizer[Config]):
         """Map the images of a batch to the encoder's input channels."""
 
     def latents(self, images: RangeImage) -> Float[Tensor, "B D h w"]:
-        """Return the continuous latents of a batch, before quantisation.
-
-        Raises:
-            ConfigError: a single image.
-        """
+        """Return the continuous latents of a batch, before quantisation."""
         if images.range_m.ndim != 3:
             raise ConfigError("a single range image", "a batch", "make one with RangeImage.stack([image])")
         return self.quant_conv(self.encoder(self._encoded(images)))

@@ -183,9 +183,6 @@ class CurveVqvae(ConvolutionalTokenizer[CurveVqvaeConfig]):
     Its discriminator is left out, whose weight is 0 after the first two steps because the program's condition is
     inverted, and so are its terms of geometry and of perception, which are off in the published configuration.
 
-    Raises:
-        ConfigError: the image's rows or columns cannot be divided as often as the strides say.
-
     Source:
         Ran et al., Towards Realistic Scene Generation with LiDAR Diffusion Models, CVPR 2024, section 3.2; layers,
         names and losses as in hancyran/LiDAR-Diffusion@8416ddb (MIT), whose published size has 15,070,361 parameters.

@@ -203,9 +203,6 @@ class Decoder(ConvolutionalDecoder):
 class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
     """The adapted VQ-VAE of LidarGRIT.
 
-    Raises:
-        ConfigError: the image's rows or columns cannot be halved at every level.
-
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2; layer sizes and state-dict names as in
         hamedhaghighi/LidarGRIT@a3f86e7.
@@ -321,9 +318,6 @@ def reconstruction_loss(
     """Return the masked absolute error of the encoded range on the pixels that truly returned.
 
     Args:
-        encoded: encoded ranges that were decoded from latents.
-        target: true ranges, encoded.
-        return_mask: true returns.
         sampled_mask: returns that were sampled, for ``reference``.
         kind: pixels that count, and the divisor.
         weights: weights of the pixels; those of each scan's returns are scaled to a mean of 1.

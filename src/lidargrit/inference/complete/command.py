@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.files import OutputConfig, Written, write_completions
@@ -18,7 +17,6 @@ def complete_scans(
     task: Task,
     output: OutputConfig,
     config: DataConfig | None = None,
-    reporter: Reporter | None = None,
 ) -> Written:
     """Write the scans of a source as a task changes them: whole clouds, or the images of the model.
 
@@ -38,8 +36,8 @@ def complete_scans(
         UsageError: all pixels are observed, or a mask of another size.
         ScanError: a scan that cannot be used, of another sensor, or without a return among the observed pixels.
     """
-    config, reporter = config or DataConfig(), reporter or Reporter()
+    config = config or DataConfig()
     reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)
-    inputs = open_inputs(source, reader, config, reporter)
+    inputs = open_inputs(source, reader, config)
     facts = {"verb": task.verb, "source": source, **task.identity()}
-    return write_completions(inputs, out, model, task, output, facts, config, reporter)
+    return write_completions(inputs, out, model, task, output, facts, config)

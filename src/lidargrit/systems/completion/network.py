@@ -129,7 +129,6 @@ class CompletionNetwork(nn.Module):
         """Return the estimate of every pixel.
 
         Args:
-            hints: classical fills of the observed pixels.
             observed: True where it was observed whether there is a return.
         """
         rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
@@ -177,9 +176,6 @@ class CompletionNetwork(nn.Module):
 
         The range is the mean of two estimates, of the scan and of its mirror image, and so are the reflectance and the
         logits of classes. A scan gets reflectance and labels if it has some and the network has learned them.
-
-        Args:
-            condition: observed pixels of as many scans.
         """
         images, uniform = [], self.mask.uniform(rngs)
         for index in range(len(rngs)):

@@ -59,9 +59,6 @@ class CompletionObjective(Objective):
         A network with classes is told those of observed pixels in three of four scans; beside the loss then stands the
         share of hidden returns whose class it finds. Reflectance is told as often; beside the loss then stands its mean
         absolute error.
-
-        Raises:
-            ConfigError: a network with classes and scans without labels, or one with reflectance and scans without it.
         """
         images = example.images
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)

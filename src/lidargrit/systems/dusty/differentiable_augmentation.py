@@ -82,5 +82,4 @@ def _cut_out(images: Tensor, rng: torch.Generator) -> Tensor:
 
 
 def _whole(low: int, high: int, count: int, rng: torch.Generator) -> Tensor:
-    """Sample whole numbers between two limits, both of them included, as a column."""
     return torch.randint(low, high + 1, (count, 1), generator=rng, device=rng.device)

@@ -15,7 +15,6 @@ def straight_through(logits: Tensor, noise: Tensor) -> Float[Tensor, "..."]:
     """Return 0 or 1 by the sign of logits + noise, with the gradient of a sigmoid.
 
     Args:
-        logits: logits of the probability of 1.
         noise: noise of the same shape, or of one that broadcasts; see :func:`logistic_noise`.
 
     Source:

@@ -292,7 +292,6 @@ class AdversarialObjective(Objective):
         return terms
 
     def _generate_encoded(self, count: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Generate encoded scans, and return beside them the share of pixels that return."""
         latents = torch.randn(count, self.config.latent_dim, generator=rng, device=rng.device)
         encoded, logits = self.synthesis(latents)
         if logits is None:
@@ -314,13 +313,6 @@ def load_published(path: Path, sensor: SensorModel | None = None) -> Dusty:
     Such a file is a dictionary saved by torch. Only ``G_ema`` is read, the moving average of the generator's weights,
     whose names lidargrit.systems.dusty.dcgan translates. The weights determine the variant and the number of channels.
     The program's images have the columns and rows of ``sensor``.
-
-    Args:
-        path: path of the file; code in it is not run.
-        sensor: sensor whose rays the images have; KITTI odometry's if not given.
-
-    Raises:
-        CheckpointError: no such file, or one that holds something else, or a model of images of another size.
 
     Source:
         kazuto1011/dusty-gan@0374a5e (MIT), trainers/dcgan_amp.py and utils/__init__.py.

@@ -52,11 +52,7 @@ class FilledRows(nn.Module):
         self.register_buffer("scale_m", torch.tensor(max(map(abs, (*_LOWEST_M, *_HIGHEST_M)))))
 
     def fit(self, images: RangeImages) -> None:
-        """Take the largest coordinate of all images as the scale.
-
-        Raises:
-            DataError: an image with no return in the box, which no neighbour can fill.
-        """
+        """Take the largest coordinate of all images as the scale."""
         largest_m = 0.0
         for first in range(0, len(images), _BATCH):
             batch = images.batch(range(first, min(first + _BATCH, len(images))))

@@ -108,8 +108,6 @@ def discriminator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, 
     """Return the least-squares loss of the discriminator.
 
     Args:
-        of_real: output of the discriminator for real images.
-        of_generated: output for generated images.
         kind: ``plain`` compares each output with a constant, 1 for real and 0 for generated (Mao et al., LSGAN, 2017).
             ``relativistic`` compares it with the mean output for the other images: 1 above it, 1 below it
             (Jolicoeur-Martineau, The relativistic discriminator, 2019).
@@ -143,8 +141,6 @@ def vae_loss(
     """Return ``loss``, the absolute error summed over the values of an image plus the weighted divergence, and both.
 
     Args:
-        images: images that were encoded.
-        reconstructed: images that were decoded.
         kl: divergence of each latent.
         kl_weight: weight of the divergence, from 0 to 1.
         free_nats: divergence of a latent, in nats, below which it adds nothing to the loss.

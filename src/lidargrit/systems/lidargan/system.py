@@ -135,13 +135,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
 
         The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
         reaches, which the largest coordinate of many scans is next to.
-
-        Args:
-            files: file of the program; code in it is not run.
-            config: rows of the image.
-
-        Raises:
-            CheckpointError: another file, or a model of another form.
         """
         (path,) = files
         weights = read_checkpoint(path, (), _BYTES_AT_MOST)
@@ -194,5 +187,4 @@ class LidarGanObjective(Objective):
         return {"loss": loss, "of_real": of_real.detach().mean(), "of_generated": of_generated.detach().mean()}
 
     def _judged(self, images: Float[Tensor, "B 2 H W"], weights: dict[str, Tensor]) -> Float[Tensor, "B"]:
-        """Return the discriminator's outputs, by given weights in place of its own."""
         return functional_call(self.discriminator, weights, (images,))[:, 0]

@@ -39,11 +39,7 @@ class LidarGenCheckpoint(NamedTuple):
 
 
 def read_lidargen_checkpoint(path: Path) -> LidarGenCheckpoint:
-    """Read sizes, noise levels and weights; no network is built, and no code in the file is run.
-
-    Raises:
-        CheckpointError: another file, or a model of another form.
-    """
+    """Read sizes, noise levels and weights; no network is built, and no code in the file is run."""
     try:
         parts = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(parts, (list, tuple)) or len(parts) != _PARTS:

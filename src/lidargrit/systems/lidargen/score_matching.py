@@ -26,14 +26,7 @@ def sigma_table(largest: float, smallest: float, levels: int) -> Float[Tensor, "
 def score_matching_errors(
     network: ScoreNetwork, clean: Float[Tensor, "B C H W"], sigma: Float[Tensor, "B"], noise: Float[Tensor, "B C H W"]
 ) -> Float[Tensor, "B"]:
-    """Return half the squared error of each image's score, summed over its values and weighed by sigma squared.
-
-    Args:
-        network: score network.
-        clean: clean images (B, C, H, W).
-        sigma: noise level of each.
-        noise: standard normal values.
-    """
+    """Return half the squared error of each image's score, summed over its values and weighed by sigma squared."""
     spread = sigma[:, None, None, None]
     score = network(clean + spread * noise, sigma).float()
     return 0.5 * (score * spread + noise).square().sum((1, 2, 3))
@@ -51,8 +44,6 @@ def langevin(
     """Sample images by annealed Langevin dynamics, and remove the noise that is left at the last level.
 
     Args:
-        network: score network.
-        start: images to begin with.
         noise: source of fresh standard normal values at each call.
         sigmas: noise levels, the largest first.
         steps_each: number of steps at each level.
@@ -79,11 +70,6 @@ def noise_left(sigmas: Float[Tensor, "levels"], steps_each: int, step_lr: float)
 
     It is computed for a network that knows all noise of an image and answers, as NCSNv2 does, with its direction alone.
     Where levels fall faster than steps remove noise, the noise of the images stays behind and is never removed.
-
-    Args:
-        sigmas: noise levels, the largest first.
-        steps_each: number of steps at each level.
-        step_lr: size of a step at the last level.
     """
     share, left = step_lr / float(sigmas[-1]) ** 2, 0.0
     for sigma in sigmas.tolist():

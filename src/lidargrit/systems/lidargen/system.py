@@ -191,15 +191,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel) -> "LidarGen":
-        """Make a generator of one checkpoint, which tells its own sizes and noise levels, but not its ``log2_scale``.
-
-        Args:
-            files: checkpoint of the program; code in it is not run.
-            config: settings that the file does not tell.
-
-        Raises:
-            CheckpointError: another file, or a model of another form.
-        """
+        """Make a generator of one checkpoint, which tells its sizes and noise levels, but not its ``log2_scale``."""
         (path,) = files
         read = read_lidargen_checkpoint(path)
         if read.image_channels not in (1, 2):
@@ -221,7 +213,6 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         return generator.eval()
 
     def _counts(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int]:
-        """Return the noise levels and the number of steps at each."""
         levels = self.config.levels if sampling.levels is None else sampling.levels
         steps_each = self.config.steps_each if sampling.steps_each is None else sampling.steps_each
         return sigma_table(self.config.sigma_largest, self.config.sigma_smallest, levels), steps_each
@@ -273,9 +264,6 @@ def encode(images: RangeImage, config: LidarGenConfig) -> Float[Tensor, "B C H W
     """Map a batch to the network's input: log2(1 + range) over ``log2_scale`` and reflectance, both in [0, 1].
 
     A missing return is 2.4e-5, and its reflectance 0.
-
-    Raises:
-        ConfigError: images without the reflectance that is to be learned.
     """
     level = (torch.log2(images.range_m + _NOTHING_M + 1) / config.log2_scale).clamp(0, 1)
     if not config.reflectance:

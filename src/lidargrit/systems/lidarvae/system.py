@@ -199,13 +199,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
 
         The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
         reaches, which the largest coordinate of many scans is next to.
-
-        Args:
-            files: file of the program; code in it is not run.
-            config: rows of the image and settings of the objective.
-
-        Raises:
-            CheckpointError: another file, or a model of another form, such as one of three coordinates.
         """
         (path,) = files
         weights = read_checkpoint(path, (), _BYTES_AT_MOST)

@@ -33,9 +33,7 @@ def noised(
     """Mix latents with noise.
 
     Args:
-        clean: latents without noise.
         share: ᾱ of each, in 64 bits.
-        noise: standard normal noise.
     """
     signal, spread = share.sqrt().to(clean.dtype), (1 - share).sqrt().to(clean.dtype)
     return signal[:, None, None, None] * clean + spread[:, None, None, None] * noise
@@ -62,10 +60,7 @@ def ddim(
     noise of a standard deviation of 0.039, which the codebook absorbs.
 
     Args:
-        denoiser: network that predicts the noise in latents.
-        noise: function that returns fresh noise at each call.
         shares: ᾱ of every time step; see :func:`signal_shares`.
-        steps: number of evaluations of the network.
         eta: share of a step's noise that is fresh; 0 for the noise of the beginning only.
 
     Source:

@@ -74,9 +74,6 @@ class LatentUnet(Network):
         latent_channels: number of channels of the input and of the output.
         grid_size: rows and columns of the latents.
 
-    Raises:
-        ConfigError: latents that cannot be halved as often as there are levels below the first.
-
     Source:
         Rombach et al., Latent Diffusion, CVPR 2022, after Dhariwal and Nichol, 2021; layers and names as in
         hancyran/LiDAR-Diffusion@8416ddb (MIT), whose published size has 257,751,560 parameters.
@@ -172,8 +169,6 @@ class _Residual(Block):
 
 
 class _Attention(Block):
-    """Self-attention between all latents."""
-
     def __init__(self, channels: int, config: LatentUnetConfig) -> None:
         super().__init__()
         self.heads = channels // config.head_channels
@@ -189,8 +184,6 @@ class _Attention(Block):
 
 
 class _Halve(nn.Module):
-    """Halve rows and columns by a 3x3 convolution."""
-
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.op = nn.Conv2d(channels, channels, 3, stride=2, padding=(1, 0))

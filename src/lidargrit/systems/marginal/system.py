@@ -85,12 +85,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
     def from_weights(
         cls, config: MarginalConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
     ) -> "Marginal":
-        """Make a generator of given counts.
-
-        Raises:
-            CheckpointError: weights of another configuration, or pixels with fewer returns than none, or more than
-                scans.
-        """
+        """Make a generator of given counts."""
         generator = super().from_weights(config, sensor, weights, source)
         counts, scans = generator.counts, generator.scans
         if bool((counts < 0).any()) or bool((counts.sum(dim=0) > scans).any()):
@@ -104,7 +99,6 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
         return _BATCH
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: NoSampling) -> RangeImage:
-        """Sample every pixel by itself."""
         if not int(self.scans):
             raise CheckpointError("a generator that has counted no scan", "one that has", "call fit_statistics first")
         edges = self._edges_m().to(self.counts.device)

@@ -67,11 +67,7 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
     def from_weights(
         cls, config: MemorisedConfig, sensor: SensorModel, weights: dict[str, Tensor], source: Path
     ) -> "Memorised":
-        """Make a generator that keeps as many scans as the weights hold.
-
-        Raises:
-            CheckpointError: weights of another configuration, or a count that is not that of the scans.
-        """
+        """Make a generator that keeps as many scans as the weights hold."""
         generator, kept = cls(config, sensor), weights.get("range_m", torch.zeros(0))
         if kept.ndim == 3:
             generator.range_m = torch.zeros(len(kept), sensor.height, sensor.width)

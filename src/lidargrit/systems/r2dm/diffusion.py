@@ -61,8 +61,6 @@ def step_back(
     """Go to a cleaner image: the predicted clean image is clipped to [-1, 1], and combined with the noisy one.
 
     Args:
-        noisy: noisy images at the log SNR ``now``.
-        predicted: noise in them, as the network predicts it.
         now: log SNR of the noisy images.
         then: log SNR to go to, higher than ``now``.
         fresh: fresh noise, to sample from q(x then | x now, x₀) (DDPM); None keeps the predicted noise (DDIM).
@@ -99,9 +97,6 @@ def sample(
     """Sample images in equal steps of time.
 
     Args:
-        denoiser: a network.
-        noise: function that returns fresh noise at each call.
-        steps: number of evaluations of the network.
         sampler: ``ddpm`` adds fresh noise after each step, ``ddim`` only at the beginning.
     """
     image = noise()
@@ -122,11 +117,8 @@ def repaint(
     """Sample images that agree with their observed pixels.
 
     Args:
-        denoiser: a network.
-        noise: function that returns fresh noise at each call.
         clean: observed values; other pixels may hold anything.
         observed: mask, True where a pixel was observed.
-        steps: number of steps of time.
         resamples: number of times that each step is taken. Between two times, fresh noise takes the image back to the
             noise level before, so that observed and generated pixels fit each other. The last step is taken once, as in
             the reference.

@@ -65,9 +65,6 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
     """Read sizes and weights; no network is built, and no code in the file is run.
 
     Only the published form is known: log range, predicted noise, cosine schedule, continuous time, Fourier features.
-
-    Raises:
-        CheckpointError: another file, a model of another form, or sizes that its weights do not have.
     """
     try:
         file = read_everything(path, _BYTES_AT_MOST)

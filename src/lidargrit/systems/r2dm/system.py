@@ -241,9 +241,6 @@ def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
         path: checkpoint in either layout of lidargrit.systems.r2dm.r2dm_checkpoint; code in it is not run.
         sensor: sensor of the images; if not given, that of the KITTI-360 weights, with rows by elevation. The network
             keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the sensor's.
-
-    Raises:
-        CheckpointError: another file, or a model of another form.
     """
     unet, reflectance, weights = read_r2dm_checkpoint(path)
     generator = R2dm(R2dmConfig(unet, reflectance), sensor or load_sensor(_PUBLISHED_SENSOR))

@@ -76,9 +76,6 @@ class EfficientUnet(Network):
         elevation_rad: elevation (H, W) of every pixel in radians.
         azimuth_rad: azimuth (H, W) of every pixel in radians.
 
-    Raises:
-        ConfigError: an image that cannot be halved as often as there are levels below the first.
-
     Source:
         Nakashima and Kurazume, R2DM, ICRA 2024, after Saharia et al., Imagen, 2022 (Efficient U-Net); layers and names
         as in kazuto1011/r2dm@1c5963d (MIT), whose published size has 31,099,650 parameters.
@@ -209,8 +206,6 @@ class _AdaptiveNorm(nn.Module):
 
 
 class _Attention(nn.Module):
-    """Self-attention between all pixels of the coarsest level."""
-
     def __init__(self, config: UnetConfig, channels: int) -> None:
         super().__init__()
         self.norm = nn.GroupNorm(config.norm_groups, channels, _EPSILON)

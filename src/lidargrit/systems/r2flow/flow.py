@@ -48,7 +48,6 @@ def u_shaped(uniform: Float[Tensor, "B"], order: Int[Tensor, "2*B"]) -> Float[Te
     """Return times that lie near 0 and near 1 more often than between them, with a density like exp(4t) + exp(4 - 4t).
 
     Args:
-        uniform: random numbers, uniform in [0, 1).
         order: random order of the times that these give and of their mirror images, of which the first B are taken.
 
     Source:
@@ -63,7 +62,6 @@ def pseudo_huber(error: Float[Tensor, "B C H W"], scale: float) -> Float[Tensor,
     """Return the mean over all values of an error that is squared where it is small, and absolute where it is large.
 
     Args:
-        error: difference of prediction and target.
         scale: size of an error between small and large.
 
     Source:
@@ -74,13 +72,7 @@ def pseudo_huber(error: Float[Tensor, "B C H W"], scale: float) -> Float[Tensor,
 
 
 def euler(velocity: Velocity, noise: Float[Tensor, "B C H W"], steps: int) -> Solved:
-    """Follow a flow in equal steps of time, with one evaluation each.
-
-    Args:
-        velocity: trained network.
-        noise: images at time 0.
-        steps: number of steps.
-    """
+    """Follow a flow in equal steps of time, with one evaluation each."""
     image = noise
     for now, then in pairwise(np.linspace(0, 1, steps + 1)):
         image = image + (then - now) * velocity(image, _times(now, image))
@@ -93,8 +85,6 @@ def dopri5(velocity: Velocity, noise: Float[Tensor, "B C H W"], tolerance: float
     All images of a batch take the same steps, so a scan that is to depend on its seed alone is a batch of its own.
 
     Args:
-        velocity: trained network.
-        noise: images at time 0.
         tolerance: largest error of a step, both in the units of the images and relative to their values.
 
     Raises:

@@ -68,9 +68,6 @@ class Hdit(Network):
         elevation_rad: elevation of every pixel's ray in radians.
         azimuth_rad: azimuth of every pixel's ray in radians.
 
-    Raises:
-        ConfigError: an image whose tokens cannot be halved as often as there are levels below the first.
-
     Source:
         Crowson et al., Hourglass Diffusion Transformer, ICML 2024, as changed in Nakashima et al., R2Flow, ICRA 2025
         (kazuto1011/r2flow@3f5afeb, MIT), whose published size has 80,908,420 parameters.
@@ -278,8 +275,6 @@ class _TimeFeedForward(nn.Module):
 
 
 class _Geglu(nn.Linear):
-    """A linear layer whose second half gates its first half."""
-
     def __init__(self, channels: int) -> None:
         super().__init__(channels, 2 * _WIDENING * channels, bias=False)
 
@@ -310,8 +305,6 @@ class _AdaptiveRms(nn.Module):
 
 
 class _Merge(nn.Module):
-    """Join the channels of 2x2 tokens: by row, by column, by channel."""
-
     def forward(self, x: Tensor) -> Tensor:
         return x.unflatten(2, (-1, 2)).unflatten(1, (-1, 2)).transpose(2, 3).flatten(3)
 

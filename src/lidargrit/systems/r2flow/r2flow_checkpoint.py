@@ -46,9 +46,6 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> R2flowCheckpoint:
 
     Args:
         sensor: sensor whose limits the ranges of the images must have.
-
-    Raises:
-        CheckpointError: another file, a model of another form, or one of ranges between other limits.
     """
     try:
         file = read_everything(path, _BYTES_AT_MOST)

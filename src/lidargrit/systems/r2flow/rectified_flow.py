@@ -95,9 +95,6 @@ def steps_of(sampling: FlowSampling, distilled_steps: int = 0) -> int:
 
     Args:
         distilled_steps: number of steps that the network was distilled to; 0 if it was not.
-
-    Raises:
-        ConfigError: steps at times that the distilled network has not learned.
     """
     steps = sampling.steps or distilled_steps or _STEPS
     if distilled_steps and (sampling.solver != "euler" or distilled_steps % steps):

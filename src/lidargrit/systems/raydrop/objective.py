@@ -49,12 +49,7 @@ class RaydropObjective(Objective):
             required_reflectance(reflectance, _SETTING)
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return the loss, and beside it the bits of a surface's return, and the mean absolute error of reflectance.
-
-        Raises:
-            ConfigError: scans whose surfaces are not marked, unless surfaces are to be estimated; or scans without
-                labels, for a network with classes, or without reflectance, for a network with it.
-        """
+        """Return the loss, and beside it the bits of a surface's return, and the mean absolute error of reflectance."""
         images = example.images
         if self.needs_marks:
             surfaces, (returned, reflectance) = images, self._marked(images)

@@ -41,9 +41,6 @@ class SegmenterObjective(Objective):
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the loss, and beside it the share of returns whose class it finds, and the mean over classes of the
         intersection over the union.
-
-        Raises:
-            ConfigError: scans without labels, or without reflectance for a network that sees it.
         """
         images = example.images
         range_m, reflectance = images.range_m, None
@@ -71,7 +68,6 @@ def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"])
     """Count the pixels of each found class (rows) and true class (columns), of those whose true class is known.
 
     Args:
-        logits: logits of the classes.
         wanted: true class, from 1 to 19; 0 where it is not known.
     """
     pairs = (logits.argmax(1) * (NUM_CLASSES + 1) + wanted).flatten()

@@ -70,9 +70,6 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
 
         Args:
             images: batch of range images (B, H, W); labels that they have are not read.
-
-        Raises:
-            ConfigError: images of other rays, or no batch.
         """
         check_images(images, self.sensor)
         self.eval()

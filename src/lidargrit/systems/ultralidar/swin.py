@@ -47,11 +47,7 @@ class SwinConfig:
 
 
 def swin_blocks(config: SwinConfig, grid: tuple[int, int]) -> nn.Sequential:
-    """Return the blocks over a grid of tokens (rows, columns).
-
-    Raises:
-        ConfigError: a grid that windows of 8x8 do not fill.
-    """
+    """Return the blocks over a grid of tokens (rows, columns)."""
     window = min(_WINDOW, *grid)
     if grid[0] % window or grid[1] % window:
         raise ConfigError(f"{grid[0]}x{grid[1]} tokens", f"multiples of {window} both", "change the cells or the patch")
@@ -104,8 +100,6 @@ class _SwinBlock(Block):
 
 
 class _WindowAttention(nn.Module):
-    """Attention of the tokens of each window, with a learned bias for every offset of two tokens."""
-
     relative_position_index: Tensor
 
     def __init__(self, config: SwinConfig, window: int) -> None:

@@ -140,12 +140,6 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
 
         ``lidargrit.systems.ultralidar.voxels.points_of_voxels`` makes points of them; the cells are those of
         ``config.autoencoder.grid``.
-
-        Args:
-            seeds: one for each scan, from 0 to 2^32 - 1.
-
-        Raises:
-            ConfigError: no seed or one out of bounds, or settings of another generator.
         """
         check_seeds(seeds)
         settings = self._settings(sampling, self.Sampling)
@@ -180,9 +174,6 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
             files: checkpoint of the program; code in it is not run.
             config: settings that the file does not tell; its grid must have as many cells as the file's.
             sensor: sensor along whose rays the voxels are seen.
-
-        Raises:
-            CheckpointError: another file, or a model of another form or for another number of cells.
         """
         (path,) = files
         read = read_ultralidar_checkpoint(path, config.autoencoder)

@@ -55,9 +55,6 @@ def read_ultralidar_checkpoint(path: Path, sizes: VoxelAutoencoderConfig) -> Ult
 
     Args:
         sizes: cells of the model, which the file does not tell.
-
-    Raises:
-        CheckpointError: another file, or a model of another form or for another number of cells.
     """
     try:
         file = read_everything(path, _BYTES_AT_MOST)

@@ -177,10 +177,5 @@ def reconstruction_loss(
 
 
 def occupied_at_random(logits: Float[Tensor, "B z y x"], uniform: Float[Tensor, "B z y x"]) -> Bool[Tensor, "B z y x"]:
-    """Return voxels that are occupied with their probability: where the logit and logistic noise are above 0.
-
-    Args:
-        logits: logits of the probabilities.
-        uniform: random numbers from 0 to 1.
-    """
+    """Return voxels that are occupied with their probability: where the logit and logistic noise are above 0."""
     return logits + uniform.log() - (1 - uniform).log() > 0

@@ -30,9 +30,6 @@ class VoxelGrid:
         cell_m: sides of a cell along x, y and z, in metres.
         cells: number of cells along x, y and z.
 
-    Raises:
-        ConfigError: a box that does not hold the sensor, or too many cells.
-
     Source:
         myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT), configuration for KITTI-360.
     """
@@ -68,13 +65,7 @@ class VoxelGrid:
 def occupied_voxels(
     points_xyz_m: Float[Tensor, "B n 3"], eligible: Bool[Tensor, "B n"], grid: VoxelGrid
 ) -> Bool[Tensor, "B z y x"]:
-    """Return which voxels hold a point; points outside the box are left out.
-
-    Args:
-        points_xyz_m: points of each scan, in metres, in the sensor's frame.
-        eligible: mask of the points that count.
-        grid: cells of the box.
-    """
+    """Return which voxels hold a point; points outside the box are left out."""
     low, side = (torch.tensor(of, dtype=torch.float32, device=points_xyz_m.device) for of in (grid.low_m, grid.cell_m))
     index = ((points_xyz_m.float() - low) / side).floor()  # in 32 bits, as the program: rounding decides at borders
     inside = eligible & ((index >= 0) & (index < index.new_tensor(grid.cells))).all(dim=-1)
@@ -96,8 +87,6 @@ def points_of_voxels(
     """Return one point in metres for each occupied voxel of one scan, by height, then y, then x.
 
     Args:
-        occupied: voxels of one scan.
-        grid: cells of the box.
         variant: ``exact`` is x, y and z of the centres. ``reference`` is what the program writes: the lower corners,
             with y before x.
 
@@ -122,8 +111,6 @@ def images_of_voxels(
     voxels beyond the sensor's limits, has no return; a range that the centre puts beyond them becomes the limit.
 
     Args:
-        occupied: voxels of each scan.
-        grid: cells of the box.
         variant: ``exact``, or ``reference`` for a picture of the clouds that UltraLiDAR's program writes: x and y are
             swapped, and the lower corner stands for the centre.
     """
