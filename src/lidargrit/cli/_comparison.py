@@ -3,7 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
+from lidargrit.cli._options import SCANS, refuse_unused, scan_settings, scan_words
 
 if TYPE_CHECKING:
     from lidargrit.evaluation.benchmark import Benchmark
@@ -19,8 +19,8 @@ DEFAULTS: dict[str, Any] = {
     "set": [],
 }
 """Settings that all systems share where the user gives none; a table that is extended keeps its own."""
-_OF_SYSTEMS = ("systems", "add", "workers", "table", *DEFAULTS)
-_OF_PAPER = ("paper_table", "data", "small", "count", "flops", "set", "table", "workers", "dry_run")
+_OF_SYSTEMS = ("systems", "add", "workers", "table", *DEFAULTS, *SCANS)
+_OF_PAPER = ("paper_table", "data", "small", "count", "flops", "table", "workers", "dry_run", *SCANS)
 _OF_COMPLETION = ("systems", "protocol", "reference", "count", "observed", "samples", "seed", "device", *SCANS)
 
 
@@ -55,12 +55,13 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
 def _systems(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
     """Return the systems to compare, and what they have in common."""
     from lidargrit.core.errors import ConfigError
+    from lidargrit.data.prepared.config import DataConfig
     from lidargrit.evaluation.benchmark import Benchmark
     from lidargrit.evaluation.comparison import EvalConfig
     from lidargrit.evaluation.table_folder import read_table
 
     refuse_unused(options, "without --paper-table or --protocol completion", _OF_SYSTEMS)
-    given = {name: value for name in DEFAULTS if (value := getattr(options, name)) not in (None, [])}
+    given = {name: value for name in (*DEFAULTS, *SCANS) if (value := getattr(options, name)) not in (None, [], "")}
     if options.add:
         if options.systems or given:
             own = [f"--{name}" if name != "count" else "-n" for name in given]
@@ -72,11 +73,12 @@ def _systems(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
         systems, benchmark = read_table(options.out)
         return [*systems, *(system for system in options.add if system not in systems)], benchmark
     chosen = DEFAULTS | given
+    reading = DataConfig(**{name: given[name] for name in ("projection", "bad_points", "bad_scans") if name in given})
     return options.systems, Benchmark(
         reference=chosen["reference"],
         num_samples=chosen["count"],
-        settings=EvalConfig(protocol=chosen["protocol"], metrics=tuple(chosen["metrics"])),
-        preset_settings=tuple(chosen["set"]),
+        settings=EvalConfig(chosen["protocol"], tuple(chosen["metrics"]), data=reading),
+        preset_settings=tuple(scan_words(options)),
         flops=chosen["flops"],
     )
 
@@ -92,7 +94,7 @@ def _paper_table(options: argparse.Namespace) -> "Reproduction | None":
     if not options.data:
         cure = "name the folder of KITTI-360 (table 1) or KITTI odometry (2, 3), or --data simulated"
         raise ConfigError(f"--paper-table {options.paper_table} without --data", "its data set", cure)
-    settings = (options.small, options.count or 0, options.flops, tuple(options.set))
+    settings = (options.small, options.count or 0, options.flops, tuple(scan_words(options)))
     return Reproduction(options.paper_table, options.data, *settings)
 
 
