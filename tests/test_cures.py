@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lidargrit.cli import build_parser, main
+from lidargrit.data.sources import open_source
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
 
@@ -55,6 +56,22 @@ def scans(tmp_path_factory) -> Path:
                 rows = rows[np.abs(np.arctan2(rows[:, 1], rows[:, 0])) < 0.7]
             (root / fault / f"{index}.bin").write_bytes(rows.tobytes())
     return root
+
+
+@pytest.mark.parametrize("sensor", ["vlp16", "hdl64e_kitti_odometry"])
+def test_the_sensor_of_files_that_name_none_is_guessed_and_told(sensor, tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "0.bin").write_bytes(points(sensor).tobytes())
+    assert open_source(str(tmp_path / "in")).sensor_name == sensor
+    told = f"no sensor is named, so {sensor} is taken, which looks closest; --sensor names another"
+    out = str(tmp_path / "out")
+    for number, words in enumerate(
+        (["prepare", "-o", out], ["view", "-o", f"{out}.png"], ["rescan", out, "--to", sensor])
+    ):
+        assert main([words[0], str(tmp_path / "in"), *words[1:]]) == 0
+        assert capsys.readouterr().err.count(told) == 1, words
+        assert main([words[0], str(tmp_path / "in"), *words[1:], "--sensor", "no_such_sensor"]) == 2, number
+        assert told not in capsys.readouterr().err
 
 
 def words_of(verb: str, folder: Path, tmp_path: Path) -> list[str]:

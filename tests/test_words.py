@@ -8,7 +8,7 @@ import pytest
 
 from lidargrit.cli import build_parser, main
 from lidargrit.core import discovery
-from lidargrit.core.errors import nearest_names
+from lidargrit.core.errors import LidarGritError, nearest_names
 
 MISTAKES = {
     "simulte": "lidargrit: got 'simulte'; wanted one such as simulate; see: lidargrit --help",
@@ -119,12 +119,24 @@ def test_scores_side_by_side_as_json(capsys, tmp_path):
 
 
 def test_help_tells_the_exit_codes(capsys):
-    for words in (["--help"], ["train", "--help"]):
-        with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    output = capsys.readouterr().out
+    assert all(f"{code} " in output.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
+
+
+def test_help_of_every_verb_fits_a_page(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = {parser.prog: len(parser.format_help().splitlines()) for parser in build_parser().verbs()}
+    assert not {verb: count for verb, count in lines.items() if count > 50}
+
+
+def test_a_traceback_is_shown_on_request_before_the_verb_or_behind_it(capsys):
+    for words in (["--debug", "export", "nowhere", "out"], ["export", "nowhere", "out", "--debug"]):
+        with pytest.raises(LidarGritError, match="nowhere"):
             main(words)
-        assert stopped.value.code == 0
-        output = capsys.readouterr().out
-        assert all(f"{code} " in output.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
+    assert main(["export", "nowhere", "out"]) == 2
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
