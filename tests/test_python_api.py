@@ -30,7 +30,7 @@ def test_dir_names_all_that_there_is():
 def test_points_of_any_kind_of_array_are_the_same_scan(scan, convert):
     points = scan.points_xyz_m.numpy()
     array = convert(points) if convert is torch.as_tensor else points.astype(convert)
-    found = lidargrit.scan_from_points(array)
+    found = lidargrit.Scan.from_points(array)
     assert torch.equal(found.points_xyz_m, scan.points_xyz_m)
     image = lidargrit.project(scan, SENSOR)
     assert torch.equal(lidargrit.project(array, "hdl64e_kitti_odometry").range_m, image.range_m)
@@ -41,7 +41,7 @@ def test_intensity_ring_and_label_come_in_their_usual_scales_and_orders(scan):
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
     from_below = np.searchsorted(np.sort(SENSOR.elevation_rad[:, 0].numpy()), elevation).clip(0, 63)
     intensity = np.arange(len(points)) % 256
-    found = lidargrit.scan_from_points(np.column_stack((points, intensity)), ring=from_below, label=[7] * len(points))
+    found = lidargrit.Scan.from_points(np.column_stack((points, intensity)), ring=from_below, label=[7] * len(points))
     assert found.reflectance is not None
     np.testing.assert_allclose(found.reflectance.numpy(), intensity / 255, atol=1e-6)
     assert found.ring is not None
@@ -107,6 +107,6 @@ def test_what_is_no_points_gets_one_line(points, message):
 
 def test_values_that_are_not_one_a_point_are_refused():
     with pytest.raises(ScanError, match=r"ring of shape \(2,\)"):
-        lidargrit.scan_from_points(np.ones((3, 3)), ring=[1, 2])
+        lidargrit.Scan.from_points(np.ones((3, 3)), ring=[1, 2])
     with pytest.raises(DataError, match="no scan in memory"):
         lidargrit.evaluate([], [np.ones((3, 3))])

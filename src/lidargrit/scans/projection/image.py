@@ -5,10 +5,11 @@ import torch
 from jaxtyping import Float32, Int32
 
 from lidargrit.core.errors import ScanError
+from lidargrit.scans.classes import CLASS_BITS
 from lidargrit.scans.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
 from lidargrit.scans.projection.sensor_check import fit_problems
 from lidargrit.scans.sensors import ProjectionName, SensorModel
-from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
+from lidargrit.scans.types import RangeImage, Scan
 
 
 def project(
