@@ -1,11 +1,15 @@
 """``import lidargrit`` as people meet it: arrays of NumPy and tensors of torch go in, whole clouds come out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import lidargrit
 from lidargrit.core.errors import DataError, ScanError
+from lidargrit.data.sources.memory import MemorySource
+from lidargrit.scans.classes import BUILDING, CAR, CLASS_BITS
 
 SENSOR = lidargrit.load_sensor("hdl64e_kitti_odometry")
 
@@ -86,6 +90,21 @@ def test_scans_in_memory_score_as_the_same_scans_of_a_source():
     assert 0 <= same < score < 1
     images = [torch.stack([lidargrit.project(each, SENSOR).range_m for each in some]) for some in streets]
     assert images[0].shape == (2, 64, SENSOR.width)
+
+
+def test_scans_in_memory_are_scored_with_their_labels_and_reflectance():
+    streets = [lidargrit.simulate(seed=seed) for seed in range(2)]
+    no_cars = [replace(one, label=torch.where(one.label & CLASS_BITS == CAR, BUILDING, one.label)) for one in streets]
+    brighter = [replace(one, reflectance=(one.reflectance + 0.3).clamp(max=1)) for one in streets]
+    for metric, changed in (("class_jsd", no_cars), ("reflectance_histogram", brighter)):
+        of_itself, of_changed = (
+            lidargrit.evaluate(one, streets, metrics=[metric]).scores[0].result.value for one in (streets, changed)
+        )
+        assert of_itself < 1e-6 < of_changed
+    image = lidargrit.project(streets[0], SENSOR)
+    read = MemorySource(streets, SENSOR).images().batch([0])
+    for plane in ("reflectance", "label"):
+        assert torch.equal(read.planes[plane][0], image.planes[plane])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -31,7 +31,8 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
-from lidargrit.scans.rescan import Rescan
+from lidargrit.scans.motion import Still
+from lidargrit.scans.rescan import Rescanned
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
@@ -48,7 +49,7 @@ def export_scans(
     config: DataConfig | None = None,
     reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
-    change: Rescan | None = None,
+    change: "ScanChange | None" = None,
 ) -> int:
     """Write every scan of a source to a file of its own; files that are there already are not written again.
 
@@ -63,7 +64,7 @@ def export_scans(
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
-        change: view of another sensor, as which each scan is written; scans stay as they are if not given.
+        change: work on each scan before it is written; scans stay as they are if not given.
 
     Returns:
         Number of scans that are there now.
@@ -78,7 +79,7 @@ def export_scans(
     config, reporter = config or DataConfig(), reporter or Reporter()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
     scans, of_images = _open(source, config, sensor)
-    read = scans.scan if change is None else _View(scans, change, reporter)
+    read = scans.scan if change is None else _Changed(scans, change, reporter)
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     check_names(source, files)
@@ -109,21 +110,32 @@ def _number_written(source: str, files: int, left_out: int) -> int:
     return files - left_out
 
 
-class _View:
-    """Scans as another sensor sees them; of the first one it tells how many rays get a point."""
+@runtime_checkable
+class ScanChange(Protocol):
+    """Work on each scan before it is written."""
 
-    def __init__(self, scans: NamedScans, change: Rescan, reporter: Reporter) -> None:
+    def identity(self) -> dict[str, Any]:
+        """Return entries of a manifest by which its scans are told from others."""
+        ...
+
+    def __call__(self, scan: Scan) -> Rescanned | Still:
+        """Return the changed scan."""
+        ...
+
+
+class _Changed:
+    """Scans after some work, of which the first is told about."""
+
+    def __init__(self, scans: NamedScans, change: ScanChange, reporter: Reporter) -> None:
         self._scans, self._change, self._reporter, self._told = scans, change, reporter, False
 
     def __call__(self, index: int) -> Scan:
-        """Return one scan as the other sensor sees it."""
-        seen = self._change(self._scans.scan(index))
+        """Return one scan after the work."""
+        changed = self._change(self._scans.timed(index))
         if not self._told:
-            look = f"; {seen.without_rows:,} look where the scans have no rows" if seen.without_rows else ""
-            points = f"{len(seen.scan):,} of {seen.rays:,} rays get a point of the first scan{look}"
-            self._reporter.message(f"{self._change.other.name}: {points}")
+            self._reporter.message(f"{printable(changed.scan.source)}: {changed.told}")
             self._told = True
-        return seen.scan
+        return changed.scan
 
 
 def _told_notes(of: str, notes: Sequence[str], told: set[str], reporter: Reporter) -> set[str]:

@@ -7,7 +7,7 @@ from typing import Literal, Required, TypeAlias, TypedDict
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 from lidargrit.core.errors import ScanError
@@ -39,7 +39,7 @@ class ScanParts(TypedDict, total=False):
     ring: Int[Tensor, "n"] | None
     label: Int[Tensor, "n"] | None
     filled: Bool[Tensor, "n"] | None
-    point_time_s: Float64[Tensor, "n"] | None
+    point_time_s: Float[Tensor, "n"] | None
     full_scale: int
     notes: tuple[str, ...]
     rows: FileRows | None

@@ -30,6 +30,12 @@ class Rescanned(NamedTuple):
     rays: int
     without_rows: int
 
+    @property
+    def told(self) -> str:
+        """How many rays have a point, in words."""
+        look = f"; {self.without_rows:,} look where the scans have no rows" if self.without_rows else ""
+        return f"{len(self.scan):,} of {self.rays:,} rays get a point of the first scan{look}"
+
 
 @dataclass(frozen=True, eq=False)
 class Rescan:

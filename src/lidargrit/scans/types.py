@@ -64,7 +64,7 @@ class Scan:
     rows: FileRows | None = None
     time_s: float | None = None
     pose: Float64[Tensor, "4 4"] | None = None
-    point_time_s: Float64[Tensor, "n"] | None = None
+    point_time_s: Float[Tensor, "n"] | None = None
 
     @classmethod
     def from_points(
