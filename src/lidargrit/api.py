@@ -9,7 +9,6 @@ import numpy as np
 from torch import Tensor
 
 from lidargrit.core.errors import ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.run_folder import PACKAGED
@@ -161,7 +160,7 @@ def evaluate(
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
     first, second = (_source(each, sensor) for each in (generated, reference))
-    return compare_pair(open_pair(first, second, settings, Reporter()), settings)
+    return compare_pair(open_pair(first, second, settings), settings)
 
 
 def _as_scan(points: Points) -> Scan:

@@ -40,7 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.export import export_scans
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.data.trajectories import read_trajectory
@@ -50,5 +49,5 @@ def run(options: argparse.Namespace) -> None:
     sensor = load_sensor(options.sensor) if options.sensor else None
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     change = UndoMotion(read_trajectory(options.undo_motion)) if options.undo_motion else None
-    count = export_scans(options.source, options.out, options.format, config, TerminalReporter(), sensor, change)
+    count = export_scans(options.source, options.out, options.format, config, sensor, change)
     print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

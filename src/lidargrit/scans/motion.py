@@ -73,7 +73,7 @@ class Still(NamedTuple):
     """A scan without the motion of its sensor.
 
     Args:
-        scan: scan.
+        scan: scan whose points are all seen from one pose.
         moved_m: distance that each point was moved, in metres.
     """
 
