@@ -21,8 +21,8 @@ from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
+from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.projection.image import told_share
-from lidargrit.scans.types import ScanBits
 
 _BATCH = 4
 _COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes
