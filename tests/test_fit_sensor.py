@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -370,3 +371,16 @@ def test_argoverse_gives_the_table_of_the_vlp32c(real):
     assert median < 0.05
     assert worst < 0.1
     assert column_azimuths_rad(fit.sensor.width).shape == fit.sensor.azimuth_rad.shape
+
+
+def test_a_sensor_that_the_package_has_is_named_and_a_mirrored_file_told():
+    sensor = load_sensor("vlp16").with_columns(600)
+    rooms = [room(sensor, seed) for seed in range(5)]
+    same = [note for note in fit_sensor(rooms).warnings if "the package has this sensor: vlp16 " in note]
+    assert len(same) == 1
+    assert not any("mirrored" in note for note in fit_sensor(rooms).warnings)
+    mirrored = [Scan(scan.points_xyz_m * torch.tensor([1.0, -1.0, 1.0]), source="mirrored") for scan in rooms]
+    assert sum("may be mirrored" in note for note in fit_sensor(mirrored).warnings) == 1
+    lifted = replace(sensor, elevation_rad=sensor.elevation_rad + math.radians(1))
+    others = [room(lifted, seed) for seed in range(5)]
+    assert not any("the package has" in note for note in fit_sensor(others).warnings)
