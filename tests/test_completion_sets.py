@@ -165,7 +165,7 @@ def test_a_doubt_about_the_sensor_is_told_once(tmp_path, heard):
     assert inputs.read(1).doubt
     warnings = [line for line in heard if line.startswith("WARNING: ")]
     assert len(warnings) == 1
-    assert "take a model of the sensor that made the scan, or name that sensor" in warnings[0]
+    assert "name the sensor that made the scan with --sensor, or take a model of it" in warnings[0]
 
 
 def test_points_without_a_pixel_are_counted_once(tmp_path, heard):

@@ -134,7 +134,8 @@ def test_view_and_inspect_project_by_elevation_and_say_so(folders, capsys, heard
     scans = str(folders / "shuffled")
     (seen,) = load_scan_sets([scans], 1)
     assert seen.images.return_mask.float().mean() > 0.5
-    assert "not in firing order" in heard[0]
+    assert "hdl64e_kitti_odometry is taken" in heard[0]
+    assert "not in firing order" in heard[1]
     assert cli.main(["inspect", scans]) == 0
     captured = capsys.readouterr()
     assert "not in firing order" in captured.err
@@ -148,7 +149,8 @@ def test_rings_of_another_sensor_are_refused_with_the_cure():
     rays = load_sensor("vlp16").elevation_rad[:, 0].double()
     scan = replace(scan, ring=(torch.atan2(z, torch.hypot(x, y))[:, None] - rays).abs().argmin(dim=1))
     with pytest.raises(
-        ScanError, match=r"take a model of the sensor that made the scan, .* \(vlp16, or find yours with .*fit-sensor"
+        ScanError,
+        match=r"name the sensor that made the scan with --sensor, .* \(vlp16, or find yours with .*fit-sensor",
     ) as refusal:
         project(scan, HDL64E)
     assert "--" not in str(refusal.value), "no option that only some commands have"
