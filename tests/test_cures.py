@@ -67,7 +67,7 @@ def test_the_sensor_of_files_that_name_none_is_guessed_and_told(sensor, tmp_path
     told = f"no sensor is named, so {sensor} is taken, which looks closest; --sensor names another"
     out = str(tmp_path / "out")
     for number, words in enumerate(
-        (["prepare", "-o", out], ["view", "-o", f"{out}.png"], ["rescan", out, "--to", sensor])
+        (["prepare", "-o", out], ["view", "-o", f"{out}.png"], ["rescan", f"{out}_seen", "--to", sensor])
     ):
         assert main([words[0], str(tmp_path / "in"), *words[1:]]) == 0
         assert capsys.readouterr().err.count(told) == 1, words
