@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidargrit import simulate
+from lidargrit import project, simulate
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.datasets import open_dataset
@@ -373,14 +373,16 @@ def test_argoverse_gives_the_table_of_the_vlp32c(real):
     assert column_azimuths_rad(fit.sensor.width).shape == fit.sensor.azimuth_rad.shape
 
 
-def test_a_sensor_that_the_package_has_is_named_and_a_mirrored_file_told():
-    sensor = load_sensor("vlp16").with_columns(600)
-    rooms = [room(sensor, seed) for seed in range(5)]
-    same = [note for note in fit_sensor(rooms).warnings if "the package has this sensor: vlp16 " in note]
-    assert len(same) == 1
-    assert not any("mirrored" in note for note in fit_sensor(rooms).warnings)
-    mirrored = [Scan(scan.points_xyz_m * torch.tensor([1.0, -1.0, 1.0]), source="mirrored") for scan in rooms]
-    assert sum("may be mirrored" in note for note in fit_sensor(mirrored).warnings) == 1
-    lifted = replace(sensor, elevation_rad=sensor.elevation_rad + math.radians(1))
-    others = [room(lifted, seed) for seed in range(5)]
-    assert not any("the package has" in note for note in fit_sensor(others).warnings)
+@pytest.mark.parametrize(("name", "columns", "edge"), [("os1_64", 256, 0.5), ("hdl32e", 276, 0.0)])
+def test_points_that_lie_half_a_column_off_keep_a_pixel_each_or_are_told(name, columns, edge):
+    """Ouster's firings are on the borders of columns that begin at +pi; 276 columns are no multiple of eight."""
+    sensor = load_sensor(name).with_columns(columns, 1)
+    sensor = replace(sensor, azimuth_offset_rad=None)
+    edge_rad = math.pi + edge * 2 * math.pi / columns
+    sensor = replace(sensor, first_edge_rad=edge_rad, azimuth_rad=column_azimuths_rad(columns, first_edge_rad=edge_rad))
+    scans = [simulate(seed, sensor) for seed in range(3)]
+    fit = fit_sensor(scans)
+    told = any("share a pixel" in warning for warning in fit.warnings)
+    hidden = 1 - int(project(scans[0], fit.sensor).return_mask.sum()) / len(scans[0])
+    assert (hidden <= 0.01) != told
+    assert told == (columns % 8 != 0)

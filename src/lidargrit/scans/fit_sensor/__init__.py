@@ -217,8 +217,7 @@ def _model(
         offsets = offsets_deg(used, row_of_point, len(rows.number), rings.lasers)
         if offsets is not None and float(np.ptp(offsets)) < _SHIFT_ASIDE_DEG:
             offsets = None
-    # The nearest number that networks can halve three times: four columns more or less, of hundreds.
-    halved = _HALVED * max(1, round((columns or _COLUMNS_UNCLEAR) / _HALVED))
+    halved = _halved(columns or _COLUMNS_UNCLEAR)
     edge_rad = first_edge_rad(used, row_of_point, halved) if halved == columns else math.pi
     return SensorModel(
         name=name,
@@ -231,6 +230,11 @@ def _model(
         azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
         first_edge_rad=edge_rad,
     )
+
+
+def _halved(columns: int) -> int:
+    """Return the nearest number that networks can halve three times: four columns more or less, of hundreds."""
+    return _HALVED * max(1, round(columns / _HALVED))
 
 
 def _projection(rows: FittedRows, rings: Rings) -> ProjectionName:
@@ -262,6 +266,11 @@ def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | Non
         found.append(f"only {scans}: rings that met little may be off; give {_FEW_SCANS} or more")
     if columns is None:
         found.append(f"the step between firings is not clear; {_COLUMNS_UNCLEAR} columns were assumed")
+    elif _halved(columns) != columns:
+        found.append(
+            f"the sensor fires in {columns:,} columns; the file has {_halved(columns):,}, which networks can halve, so "
+            f"that some points share a pixel (--columns {columns} keeps them apart where a command takes it)"
+        )
     if rings.method == "elevation clusters":
         found.append("the files do not tell which laser fired a point: rows are where elevations gather")
     poor = int((rows.num_points < 0.05 * np.median(rows.num_points)).sum())
