@@ -151,9 +151,8 @@ def test_rings_of_another_sensor_are_refused_with_the_cure():
     with pytest.raises(
         ScanError,
         match=r"name the sensor that made the scan with --sensor, .* \(vlp16, or find yours with .*fit-sensor",
-    ) as refusal:
+    ):
         project(scan, HDL64E)
-    assert "--" not in str(refusal.value), "no option that only some commands have"
     assert "fewer lasers" in doubts_about_rays(scan, load_sensor("os1_64"), "spherical")
     assert "have fewer columns" in doubts_about_rays(scan, load_sensor("vlp16"), "spherical")
     upper_half = simulate(seed=0, sensor=load_sensor("vlp32c").with_columns(360))
