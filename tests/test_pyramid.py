@@ -114,6 +114,19 @@ def test_a_training_step_reaches_every_level_and_the_loss_falls():
     assert moved == {"0", "1", "2"}
 
 
+def test_scans_of_which_no_level_is_sampled_are_the_true_ones_and_others_keep_the_coarser_levels():
+    model, images = pyramid(), some_images()
+    model.eval()
+    assert torch.equal(model.resample(images, [0, 1], levels=0).range_m, images.range_m)
+    one = model.resample(images, [0, 1], levels=1)
+    assert not torch.equal(one.range_m, images.range_m)
+    assert torch.equal(one.range_m[1], model.resample(images[[1]], [1], levels=1).range_m[0])
+    empty = ~nearest_of_four(images, halved_sensor(SENSOR)).return_mask.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    assert float(one.return_mask[empty].float().mean()) < 0.02  # a cell without a return gets next to none
+    sampled = model.resample(images, [5, 6], levels=3)
+    assert torch.equal(sampled.range_m, model.sample([5, 6]).range_m)
+
+
 def test_sizes_that_the_levels_cannot_halve_are_refused():
     with pytest.raises(ConfigError, match="for 7 levels"):
         Pyramid(replace(Pyramid.smallest_config(SENSOR), levels=7), SENSOR)

@@ -26,6 +26,7 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
 from lidargrit.generation.tokens import TokenGenerator
 from lidargrit.scans.types import RangeImage
+from lidargrit.systems.pyramid.system import Pyramid
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.stage import StageTraining
 
@@ -149,19 +150,19 @@ def _fit(
 
 @torch.no_grad()
 def _judged(generator: Generator, stage: str, truth: RangeImage, device: torch.device) -> Iterator[tuple[str, float]]:
-    """Yield what the first stage keeps of streets: ranges, and poles and trunks where they stood."""
-    if stage not in _FIRST_STAGE or not isinstance(generator, TokenGenerator):
-        return
+    """Yield what the first stage keeps of streets: ranges, and poles and trunks where they stood.
+
+    Of a pyramid it is what the two finest levels make of the true coarser ones: 4,096 ranges of 64x1024.
+    """
     generator.to(device).eval()
-    tokenizer, pixels = generator.get_tokenizer(), generator.pixels
-    made = []
-    for index in range(len(truth)):
-        decoded = tokenizer.decode(tokenizer.encode(truth[[index]].to(device)))
-        if stage == "pixels" and isinstance(pixels, PixelDecoder):
-            made.append(pixels.sample(decoded, [torch.Generator().manual_seed(index)]).to("cpu"))
-        else:
-            made.append(decoded.threshold().to("cpu"))
-    whole = RangeImage.cat(made)
+    if isinstance(generator, Pyramid):
+        whole = generator.resample(truth, range(len(truth))).to("cpu")
+    elif isinstance(generator, TokenGenerator) and stage in _FIRST_STAGE:
+        whole = RangeImage.cat(
+            [_from_tokens(generator, stage, truth[[index]].to(device), index) for index in range(len(truth))]
+        )
+    else:
+        return
     both = truth.return_mask & whole.return_mask
     error_m = (whole.range_m - truth.range_m).abs()
     kept = kept_objects(truth, whole)
@@ -171,3 +172,12 @@ def _judged(generator: Generator, stage: str, truth: RangeImage, device: torch.d
     yield "within_5_percent", float(((error_m <= 0.05 * truth.range_m) & both).sum() / truth.return_mask.sum())
     yield "range_mae_m", float(error_m[both].mean())
     yield "mask_agrees", float((truth.return_mask == whole.return_mask).float().mean())
+
+
+def _from_tokens(generator: TokenGenerator, stage: str, image: RangeImage, seed: int) -> RangeImage:
+    """Return what a scan's own tokens decode to, or what the pixel decoder samples from them once it is trained."""
+    tokenizer = generator.get_tokenizer()
+    decoded, pixels = tokenizer.decode(tokenizer.encode(image)), generator.pixels
+    if stage == "pixels" and isinstance(pixels, PixelDecoder):
+        return pixels.sample(decoded, [torch.Generator().manual_seed(seed)]).to("cpu")
+    return decoded.threshold().to("cpu")

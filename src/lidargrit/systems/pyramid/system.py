@@ -1,6 +1,7 @@
 """Nearest ranges from coarse to fine: seeds → range images, each level given the one of half its size."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -17,10 +18,11 @@ from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling, nats
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.random import rngs_of
+from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import Decoded, RangeImage, ScanBits
+from lidargrit.scans.types import Decoded, RangeImage
 from lidargrit.systems.pyramid.network import Level, ParentNetwork, halved_sensor, nearest_of_four
 
 _ROW_HALVINGS = 2  # of a level's phases: then pixels above one another know of one another, as those of a pole have to
@@ -111,9 +113,35 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
         rngs, images, told = rngs_of(seeds), None, None
         for level in reversed(levels_of(self.levels)):
-            images, told = level.sample(images, told, rngs, sampling if level.sensor is self.sensor else None)
+            images, told = level.sample(images, told, rngs, self._finest(level, sampling))
         assert images is not None
         return images
+
+    @torch.no_grad()
+    def resample(self, images: RangeImage, seeds: Sequence[int], levels: int = 2) -> RangeImage:
+        """Return scans whose finest levels are sampled given the true coarser ones, which tell what these keep.
+
+        Args:
+            images: true scans.
+            seeds: seed of each scan.
+            levels: number of levels that are sampled.
+        """
+        every, made = levels_of(self.levels), []
+        for index, seed in enumerate(seeds):
+            pyramid = images_of(every, images[[index]].to(self.device))[levels:]
+            rngs, told, coarser = [torch.Generator().manual_seed(seed)], None, None
+            for level, true in zip(reversed(every), [*reversed(pyramid), *[None] * levels], strict=True):
+                if true is not None:
+                    told, coarser = level.guided(coarser, told)[1], true
+                else:
+                    coarser, told = level.sample(coarser, told, rngs, self._finest(level, PixelSampling()))
+            assert coarser is not None
+            made.append(coarser)
+        return RangeImage.cat(made)
+
+    def _finest(self, level: Level, sampling: PixelSampling) -> PixelSampling | None:
+        """Return the settings for a level: those that are asked for are of the finest."""
+        return sampling if level.sensor is self.sensor else None
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         """Return the bits of mask and ranges given the coarser level, and those of all coarser levels as tokens."""
