@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -18,7 +19,7 @@ from lidargrit.systems.completion.objective import CompletionObjective
 
 
 @dataclass(frozen=True)
-class CompletionConfig:
+class CompletionConfig(Settings):
     """The network, which is the whole system.
 
     Args:

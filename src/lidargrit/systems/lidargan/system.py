@@ -9,7 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.configuration import Settings
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.typed_values import Count
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -29,7 +31,7 @@ from lidargrit.systems.lidargan.networks import (
     AdversarialLoss,
     Decoder,
     Encoder,
-    check_initial_std,
+    InitialStd,
     discriminator_loss,
     generator_loss,
     without_counters,
@@ -39,7 +41,7 @@ _BYTES_AT_MOST = 1 << 29  # the published network takes 16 MB
 
 
 @dataclass(frozen=True)
-class LidarGanConfig:
+class LidarGanConfig(Settings):
     """Networks and loss of LidarGAN; the defaults are the published ones.
 
     Args:
@@ -53,18 +55,12 @@ class LidarGanConfig:
         initial_std: standard deviation of the new weights of both networks.
     """
 
-    latent_dim: int = 100
-    channels: int = 64
+    latent_dim: Count = 100
+    channels: Count = 64
     rows: int = 40
     first_row: int = 17
     loss: AdversarialLoss = "relativistic"
-    initial_std: float = 0.02
-
-    def __post_init__(self) -> None:
-        for name in ("latent_dim", "channels"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
-        check_initial_std(self.initial_std)
+    initial_std: InitialStd = 0.02
 
 
 class LidarGan(Generator[LidarGanConfig, NoSampling]):

@@ -6,16 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
-from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import is_temperature
+from lidargrit.core.configuration import Settings
+from lidargrit.core.typed_values import Bounds, NotNegative, Temperature
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
@@ -44,7 +43,7 @@ _GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
 
 
 @dataclass(frozen=True)
-class TokenSampling(TypedSettings):
+class TokenSampling(Settings):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -76,10 +75,10 @@ class TokenSampling(TypedSettings):
             has instructions for it.
     """
 
-    temperature: float = 1.0
-    top_k: int = 0
-    top_p: float = 1.0
-    guidance: float = 0.0
+    temperature: Temperature = 1.0
+    top_k: NotNegative = 0
+    top_p: Annotated[float, Bounds(above=0, most=1)] = 1.0
+    guidance: Annotated[float, Bounds(1, _GUIDANCE_AT_MOST, or_0=True)] = 0.0
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
     range_noise: float = PixelSampling.range_noise
@@ -90,15 +89,6 @@ class TokenSampling(TypedSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.pixels()
-        if not (is_temperature(self.temperature) and self.top_k >= 0 and 0 < self.top_p <= 1):
-            raise ConfigError(
-                f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
-                "temperature 0 or at least 1e-6, top_k >= 0, 0 < top_p <= 1",
-                "correct the one that is out of bounds",
-            )
-        if self.guidance and not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
-            wanted = f"1 to {_GUIDANCE_AT_MOST}, or 0 for the model's own"
-            raise ConfigError(f"guidance={self.guidance}", wanted, "correct it")
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
@@ -114,11 +104,7 @@ class LidarGritConfig(TokenGeneratorConfig):
             model is found on validation scans.
     """
 
-    guidance: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
-            raise ConfigError(f"guidance={self.guidance}", f"1 to {_GUIDANCE_AT_MOST}", "correct it")
+    guidance: Annotated[float, Bounds(1, _GUIDANCE_AT_MOST)] = 1.0
 
 
 class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):

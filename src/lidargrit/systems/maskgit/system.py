@@ -3,15 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Int
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
-from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import STEPS_AT_MOST, is_temperature
+from lidargrit.core.configuration import Settings
+from lidargrit.core.typed_values import Bounds, Temperature, Weight
+from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
@@ -29,7 +30,7 @@ _NOT_ASKED = -100  # in the place of tokens that are shown, for torch's cross en
 
 
 @dataclass(frozen=True)
-class MaskedSampling(TypedSettings):
+class MaskedSampling(Settings):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -53,9 +54,9 @@ class MaskedSampling(TypedSettings):
         decoder: number type of the tokenizer's decoder and of the pixel decoder, with the same choices.
     """
 
-    steps: int = 16
-    temperature: float = 1.0
-    order_temperature: float = 4.5
+    steps: Annotated[int, Bounds(1, STEPS_AT_MOST)] = 16
+    temperature: Temperature = 1.0
+    order_temperature: Weight = 4.5
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
     range_noise: float = PixelSampling.range_noise
@@ -66,13 +67,6 @@ class MaskedSampling(TypedSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.pixels()
-        valid = is_temperature(self.temperature) and self.order_temperature >= 0
-        if not (valid and 1 <= self.steps <= STEPS_AT_MOST):
-            raise ConfigError(
-                f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",
-                f"1 to {STEPS_AT_MOST:,} steps, temperature 0 or at least 1e-6, order_temperature at least 0",
-                "correct the one that is out of bounds",
-            )
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -17,7 +18,7 @@ from lidargrit.scans.types import RangeImage, ScanBits
 
 
 @dataclass(frozen=True)
-class MultiscaleConfig:
+class MultiscaleConfig(Settings):
     """The networks of the pixel decoder, which is the whole system.
 
     Args:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
@@ -33,7 +34,7 @@ _COST_SEED = 0
 
 
 @dataclass(frozen=True)
-class R2flowConfig:
+class R2flowConfig(Settings):
     """Channels, network and trainings of R2Flow.
 
     Args:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
@@ -19,7 +20,7 @@ from lidargrit.systems.raydrop.objective import RaydropObjective
 
 
 @dataclass(frozen=True)
-class RaydropConfig:
+class RaydropConfig(Settings):
     """The network, which is the whole system.
 
     Args:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -17,7 +18,7 @@ from lidargrit.systems.segmenter.objective import SegmenterObjective
 
 
 @dataclass(frozen=True)
-class SegmenterConfig:
+class SegmenterConfig(Settings):
     """The network, which is the whole system.
 
     Args:
