@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import sys
 from dataclasses import dataclass
 from numbers import Integral, Real
 from types import UnionType
@@ -95,11 +96,11 @@ def fits(hint: Any, value: Any) -> bool:
 
 
 def _is_a(kind: type, value: Any) -> bool:
-    if kind is int:
-        return isinstance(value, Integral) and not isinstance(value, bool) and abs(int(value)) <= WHOLE_NUMBER_AT_MOST
-    if kind is float:
-        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    return isinstance(value, kind)
+    if kind not in (int, float):
+        return isinstance(value, kind)
+    is_number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    largest = WHOLE_NUMBER_AT_MOST if kind is int else sys.float_info.max  # infinity and NaN lie outside
+    return is_number and -largest <= value <= largest
 
 
 def check(hint: Any, value: Any, name: str) -> None:

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.encoding_cache import EncodingCache, Frozen
 from lidargrit.generation.facts import Cost
@@ -37,7 +38,7 @@ PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
 
 
 @dataclass(frozen=True)
-class TokenGeneratorConfig:
+class TokenGeneratorConfig(Settings):
     """The networks of a generator of tokens.
 
     Args:
