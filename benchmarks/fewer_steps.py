@@ -20,8 +20,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
+from lidargrit.core import reporting
 from lidargrit.core.configuration import override
-from lidargrit.core.reporting import TerminalReporter
 from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.benchmark import run as run_benchmark
 from lidargrit.evaluation.comparison import EvalConfig
@@ -127,7 +127,7 @@ def main() -> None:
         *(f"{run}:{','.join(words)}" for (run, _), words in zip(few, chosen, strict=True)),
     ]
     benchmark = Benchmark(f"simulated:{options.n}:test", options.n, EvalConfig(metrics=tuple(METRICS)))
-    scores = run_benchmark(systems, options.out, benchmark, TerminalReporter())
+    scores = run_benchmark(systems, options.out, benchmark)
     rows = []
     for (run, steps), words, path in zip([(options.exact_run, None), *few], [[], *chosen], scores, strict=True):
         generator = load(run)
@@ -145,4 +145,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with reporting.to(reporting.TerminalReporter()):
+        main()

@@ -212,7 +212,7 @@ def main() -> None:
     options = parser.parse_args()
     sensor, model = load_sensor(options.sensor), RaydropModel()
     config = DataConfig(bad_scans="skip")
-    real = load_range_images(tuple(options.train), config, None, sensor)
+    real = load_range_images(tuple(options.train), config, sensor)
     begun = time.perf_counter()
     streets = [Street(seed, sensor) for seed in range(FIRST_SEED, FIRST_SEED + options.scans)]
     assert streets[0].sample(model)[1].range_m.equal(simulate_pair(FIRST_SEED, sensor)[1].range_m)
@@ -223,7 +223,7 @@ def main() -> None:
         options.json.write_text(json.dumps(asdict(fitted)))
     held_out = [Street(seed, sensor) for seed in range(VAL_SEED, VAL_SEED + options.scans)]
     for source in filter(None, ("train", options.val)):
-        scans = real if source == "train" else load_range_images((source,), config, None, sensor)
+        scans = real if source == "train" else load_range_images((source,), config, sensor)
         for what, which in (("before", model), ("after", fitted))[: 2 if options.rounds else 1]:
             print(f"\n{source}, {what} the fit, other seeds\n{as_table(compare(simulated(held_out, which), scans))}")
 

@@ -10,9 +10,9 @@ here and its figures taken from there. OUT keeps runs, samples and scores, and t
 import argparse
 from pathlib import Path
 
+from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import TrainingError
-from lidargrit.core.reporting import TerminalReporter
 from lidargrit.data.run_folder import is_run
 from lidargrit.evaluation.benchmark import Benchmark, as_table
 from lidargrit.evaluation.benchmark import run as run_benchmark
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("-n", "--count", type=int, default=64, help="number of samples of each")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of every preset")
     options = parser.parse_args()
-    reporter, rows = TerminalReporter(), []
+    rows = []
     for system in options.systems:
         name, _, sampling = system.partition(":")
         scaled = with_budget(load_preset(name, options.set), options.flops)
@@ -44,18 +44,19 @@ def main() -> None:
             preset = override(scaled, [f"training.{stage}.learning_rate={rate!r}" for stage, rate in rates.items()])
             run = options.out / "runs" / f"{name}.rate{factor:g}"
             told = ", ".join(f"{stage} {rate:.2g}" for stage, rate in rates.items())
-            reporter.message(f"{run.name}: {flops:.3g} floating-point operations, learning rates {told}")
+            reporting.message(f"{run.name}: {flops:.3g} floating-point operations, learning rates {told}")
             check_folder(run, preset)
             try:
                 if not is_run(run):
-                    train(preset, run, reporter)
+                    train(preset, run)
             except TrainingError as error:  # it diverged
-                reporter.message(f"{run.name} is left out: {error}")
+                reporting.message(f"{run.name} is left out: {error}")
                 continue
             rows.append(f"{run}:{sampling}" if sampling else str(run))
     benchmark = Benchmark(options.against, options.count, EvalConfig(metrics=METRICS))
-    print(as_table(run_benchmark(rows, options.out, benchmark, reporter)))
+    print(as_table(run_benchmark(rows, options.out, benchmark)))
 
 
 if __name__ == "__main__":
-    main()
+    with reporting.to(reporting.TerminalReporter()):
+        main()

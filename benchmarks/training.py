@@ -23,6 +23,7 @@ import torch
 from torch import nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from lidargrit.core import reporting
 from lidargrit.core.reporting import Progress, Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import load_range_images
@@ -97,8 +98,9 @@ def ours(generator: Generator, stage: str, preset: Preset, images: RangeImages, 
     scans = (UNTIMED + steps) * config.batch_size
     never = {"validate_every": 10**9, "checkpoint_every": 10**9, "validation_scans": 1}
     heard = StepClock()
-    fit = StageTraining(generator.objective(stage), replace(config, scans=scans, **never), folder, 0, heard)
-    fit.run(images, images, stage)
+    fit = StageTraining(generator.objective(stage), replace(config, scans=scans, **never), folder, 0)
+    with reporting.to(heard):
+        fit.run(images, images, stage)
     return steps * config.batch_size / (heard.times[-1] - heard.times[UNTIMED - 1])
 
 

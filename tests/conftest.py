@@ -4,7 +4,7 @@ import inspect
 import os
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jaxtyping
@@ -14,6 +14,7 @@ import torch
 from hypothesis import settings
 
 from browser import CHROMIUM, Browser
+from lidargrit.core import reporting
 
 SHARED = Path(os.environ.get("LIDARGRIT_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
@@ -58,6 +59,22 @@ def _signal_handlers():
     for number in left:
         signal.signal(number, before[number])
     assert not left
+
+
+class Listener(reporting.Reporter):
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.lines.append(text)
+
+
+@pytest.fixture
+def heard() -> Iterator[list[str]]:
+    """Yield the lines that are reported while a test runs."""
+    listener = Listener()
+    with reporting.to(listener):
+        yield listener.lines
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import torch
 
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.evaluation import benchmark
 from lidargrit.evaluation.benchmark import run as run_benchmark
@@ -21,15 +20,7 @@ from test_benchmark import BENCHMARK
 SENSOR = load_sensor("vlp16").with_columns(32)
 
 
-class Listener(Reporter):
-    def __init__(self):
-        self.lines = []
-
-    def message(self, text):
-        self.lines.append(text)
-
-
-def test_scores_are_computed_again_with_weights_that_came_since(tmp_path):
+def test_scores_are_computed_again_with_weights_that_came_since(tmp_path, heard):
     file, path = tmp_path / "weights.pth", tmp_path / "scores.json"
     metrics = "return_rate_per_ring", "frechet_pointcloud_distance"
     plain = Resampling(halves=0)
@@ -38,10 +29,10 @@ def test_scores_are_computed_again_with_weights_that_came_since(tmp_path):
     pair = replace(pair, samples=replace(pair.samples, indices=range(2, 4)))
 
     def scored():
-        listener = Listener()
-        benchmark._score(pair, settings, path, listener)
+        heard.clear()
+        benchmark._score(pair, settings, path)
         there = json.loads(path.read_text())
-        return there["scores"], there["left_out"], any("are there already" in line for line in listener.lines)
+        return there["scores"], there["left_out"], any("are there already" in line for line in heard)
 
     scores, left_out, _ = scored()
     assert [each["metric"] for each in left_out] == ["frechet_pointcloud_distance"]
@@ -71,11 +62,11 @@ def test_a_few_samples_are_those_of_the_first_seeds(tmp_path):
     assert (six["scans"], six["scans_used"]) == (6, 3)
 
 
-def test_it_is_told_which_limit_held(tmp_path, monkeypatch):
+def test_it_is_told_which_limit_held(tmp_path, monkeypatch, heard):
     def told(folder, **changes):
-        listener = Listener()
-        run_benchmark(["marginal"], tmp_path / folder, replace(BENCHMARK, **changes), listener)
-        (line,) = (line for line in listener.lines if "as many are compared" in line)
+        heard.clear()
+        run_benchmark(["marginal"], tmp_path / folder, replace(BENCHMARK, **changes))
+        (line,) = (line for line in heard if "as many are compared" in line)
         return line
 
     assert "simulated:6:test has 6 scans" in told("reference", reference="simulated:6:test")

@@ -11,7 +11,6 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, DataError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.formats import read_scan
 from lidargrit.data.formats.kitti_bin import KittiBin
@@ -166,7 +165,7 @@ def test_an_image_whose_name_is_no_text_is_refused(tmp_path):
     with Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff.npy")).open("wb") as file:
         np.save(file, np.full((64, 32), 9, np.float32))
     with pytest.raises(DataError, match="which is not UTF-8"):
-        open_inputs(str(tmp_path), ScanReader(SENSOR), DataConfig(), Reporter())
+        open_inputs(str(tmp_path), ScanReader(SENSOR), DataConfig())
 
 
 def test_two_images_whose_names_differ_in_letters_alone_are_two_files(tmp_path, recwarn):

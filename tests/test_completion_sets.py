@@ -10,7 +10,6 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import OutputError
 from lidargrit.core.files import write_text
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
@@ -153,31 +152,27 @@ def test_a_sensor_that_fires_less_often_is_doubted():
     assert ScanReader(source).read(scan).doubt == ""
 
 
-def two_walls(folder, sensor, columns, told):
-    """Return two scans of so many columns as inputs for a sensor, whose messages are collected."""
+def two_walls(folder, sensor, columns):
+    """Return two scans of so many columns as inputs for a sensor."""
     for name in ("0.npz", "1.npz"):
         NumpyArray.write(folder / name, unproject(wall(sensor.with_columns(columns), 0)))
-    reporter = Reporter()
-    reporter.message = told.append
-    return open_inputs(str(folder), ScanReader(sensor), DataConfig(), reporter)
+    return open_inputs(str(folder), ScanReader(sensor), DataConfig())
 
 
-def test_a_doubt_about_the_sensor_is_told_once(tmp_path):
-    sensor, told = load_sensor("hdl64e_kitti_odometry"), []
-    inputs = two_walls(tmp_path, sensor, 870, told)
+def test_a_doubt_about_the_sensor_is_told_once(tmp_path, heard):
+    inputs = two_walls(tmp_path, load_sensor("hdl64e_kitti_odometry"), 870)
     assert inputs.read(0).doubt
     assert inputs.read(1).doubt
-    warnings = [line for line in told if line.startswith("WARNING: ")]
+    warnings = [line for line in heard if line.startswith("WARNING: ")]
     assert len(warnings) == 1
     assert "take a model of the sensor that made the scan, or name that sensor" in warnings[0]
 
 
-def test_points_without_a_pixel_are_counted_once(tmp_path):
-    sensor, told = load_sensor("hdl64e_kitti_odometry"), []
-    inputs = two_walls(tmp_path, sensor, 1024, told)
+def test_points_without_a_pixel_are_counted_once(tmp_path, heard):
+    inputs = two_walls(tmp_path, load_sensor("hdl64e_kitti_odometry"), 1024)
     kept = [int(inputs.read(index).image.return_mask.sum()) for index in range(2)]
     points = len(inputs.read(0).points)
-    counted = [line for line in told if not line.startswith("WARNING: ")]
+    counted = [line for line in heard if not line.startswith("WARNING: ")]
     assert [f"holds {kept[0]:,} of the {points:,} points" in line for line in counted] == [True]
 
 
@@ -203,6 +198,6 @@ def test_a_demo_holds_out_a_drive_of_a_seventh(tmp_path):
             path = tmp_path / "sequences" / drive / "velodyne" / f"{number:06d}.bin"
             path.parent.mkdir(parents=True, exist_ok=True)
             np.ones((200, 4), "<f4").tofile(path)
-    config = divided(f"kitti_odometry:{tmp_path}", Reporter())
+    config = divided(f"kitti_odometry:{tmp_path}")
     assert config.train[0].endswith(":01+02")
     assert config.val[0].endswith(":00")

@@ -12,7 +12,6 @@ from PIL import Image
 from format_examples import NAMES, can_write, written
 from lidargrit.core.errors import DataError, OutputError, ScanError, UnknownNameError
 from lidargrit.core.files import write_json
-from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.datasets import ScanDataset, load, open_dataset
 from lidargrit.data.datasets.folder import Folder
@@ -184,14 +183,6 @@ def test_a_folder_of_all_formats_is_listed_and_read(mixed):
         assert len(dataset.scan(index)) > 1000
 
 
-class Heard(Reporter):
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-
-    def message(self, text: str) -> None:
-        self.messages.append(text)
-
-
 def test_what_one_scan_lacks_no_batch_has(tmp_path):
     (tmp_path / "scans").mkdir()
     points = np.random.default_rng(0).uniform(-20, 20, (2000, 4)).astype(np.float32)
@@ -206,7 +197,7 @@ def test_what_one_scan_lacks_no_batch_has(tmp_path):
     assert alike.batch([0, 1]).reflectance is not None
 
 
-def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, monkeypatch):
+def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, monkeypatch, heard):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     folder = tmp_path / "scans"
     folder.mkdir()
@@ -217,13 +208,12 @@ def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, mo
     (folder / "bad.ply").write_bytes(good[: len(good) // 2])
     with pytest.raises(ScanError, match=r"bad\.ply.*data\.bad_scans=skip"):
         load_range_images([str(folder)], DataConfig())
-    reporter = Heard()
-    images = load_range_images([str(folder)], DataConfig(bad_scans="skip"), reporter)
+    images = load_range_images([str(folder)], DataConfig(bad_scans="skip"))
     assert len(images) == 5
-    (left_out,) = [message for message in reporter.messages if message.startswith("left out: ")]
+    (left_out,) = [message for message in heard if message.startswith("left out: ")]
     assert str(folder / "bad.ply") in left_out
     lacking = f"WARNING: no reflectance in 1 of 5 scans, such as {folder / 'xyz_bin.bin'}, so that no scan is read with"
-    assert any(message.startswith(lacking) for message in reporter.messages)
+    assert any(message.startswith(lacking) for message in heard)
 
 
 def test_an_example_overwrites_nothing(bin_file, tmp_path):

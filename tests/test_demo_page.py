@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.run_folder import RUN_FILE
 from lidargrit.evaluation.intervals import RealAgainstReal
@@ -45,7 +44,7 @@ def scored():
     images = RangeImages(SENSOR, [Store()])
     generator = made("lidargrit")[0]
     sampled = RangeImages(SENSOR, [Sampled(generator.sample(range(12)))])
-    return sampled, demo._score(sampled, images, Reporter())
+    return sampled, demo._score(sampled, images)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.export import MANIFEST, KittiTree, export_scans
 from lidargrit.data.formats import read_scan
@@ -323,8 +322,6 @@ def test_the_command(samples, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("kind", "told"), [("bin", [".bin keeps no labels"]), ("npz", []), ("kitti_odometry", [])])
-def test_labels_that_a_format_does_not_keep_are_told_once(streets, tmp_path, monkeypatch, kind, told):
-    reporter, said = Reporter(), []
-    monkeypatch.setattr(reporter, "message", said.append)
-    export_scans(streets, tmp_path, kind, DataConfig(max_scans=2), reporter)
-    assert [text.partition(";")[0] for text in said] == told
+def test_labels_that_a_format_does_not_keep_are_told_once(streets, tmp_path, kind, told, heard):
+    export_scans(streets, tmp_path, kind, DataConfig(max_scans=2))
+    assert [text.partition(";")[0] for text in heard] == told

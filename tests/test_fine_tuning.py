@@ -8,7 +8,6 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.export import export_scans
 from lidargrit.training.fine_tuning import columns_like, fine_tuning_preset
 
@@ -27,10 +26,10 @@ def scans(tmp_path_factory):
 
 
 def test_scans_seen_grow_with_the_scans_that_there_are_and_some_are_held_out(scans):
-    preset = fine_tuning_preset(str(scans), Reporter())
+    preset = fine_tuning_preset(str(scans))
     assert preset.training["transformer"].scans == 800
     assert (preset.data.train, preset.data.val) == ((f"folder:{scans}:all[:85%]",), (f"folder:{scans}:all[85%:]",))
-    many = fine_tuning_preset("simulated:500:train", Reporter())
+    many = fine_tuning_preset("simulated:500:train")
     assert many.training["transformer"].scans == 8000
     assert many.data.load_sensor().same_rays(lidargrit.load("pretrained").sensor)
 
@@ -40,7 +39,7 @@ def test_images_of_another_sensor_of_64_rows_are_as_wide_as_the_models():
     assert columns_like(own, lidargrit.load_sensor("os1_64")) == (1024, 4)
     assert columns_like(own, lidargrit.load_sensor("pandar64"))[0] % own.width == 0
     with pytest.raises(ConfigError, match="scans of 16 rows"):
-        fine_tuning_preset("simulated:8:train", Reporter(), "vlp16")
+        fine_tuning_preset("simulated:8:train", "vlp16")
 
 
 def test_the_verb_tells_the_time_trains_all_stages(scans, tmp_path, capsys):

@@ -9,7 +9,6 @@ import torch
 
 from lidargrit import cli
 from lidargrit.core.errors import ConfigError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_source
@@ -22,16 +21,6 @@ from lidargrit.simulator import simulate
 from lidargrit.viewer.scan_sets import load_scan_sets
 
 HDL64E = load_sensor("hdl64e_kitti_odometry")
-
-
-class Listener(Reporter):
-    """Keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def message(self, text: str) -> None:
-        self.lines.append(text)
 
 
 @pytest.fixture(scope="module")
@@ -101,12 +90,11 @@ def test_a_cut_sweep_is_refused_as_before_and_not_taken_for_another_order(fired)
 
 
 @pytest.mark.parametrize("protocol", ["exact", "lidargrit-kitti-odometry"])
-def test_a_shuffled_set_is_compared_as_if_it_were_in_order(folders, protocol):
+def test_a_shuffled_set_is_compared_as_if_it_were_in_order(folders, protocol, heard):
     """Scored without a word before: rows by an order that there is not."""
-    listener = Listener()
     names = [str(folders / name) for name in ("shuffled", "fired")]
-    pair = pair_for_protocol(*map(open_source, names), load_protocol(protocol), DataConfig(), listener)
-    assert sum("not in firing order" in line and names[0] in line for line in listener.lines) == 1
+    pair = pair_for_protocol(*map(open_source, names), load_protocol(protocol), DataConfig())
+    assert sum("not in firing order" in line and names[0] in line for line in heard) == 1
     ours, theirs = pair.samples.batch([0, 1]), pair.reference.batch([0, 1])
     assert torch.equal(ours.range_m, theirs.range_m)
     by_ring = open_source(names[1]).images(HDL64E).batch([0, 1])
@@ -142,11 +130,11 @@ def test_an_order_that_is_asked_for_is_not_replaced(folders):
         open_source(str(folders / "shuffled")).images(HDL64E, DataConfig(projection="unfolding"))
 
 
-def test_view_and_inspect_project_by_elevation_and_say_so(folders, capsys):
-    scans, listener = str(folders / "shuffled"), Listener()
-    (seen,) = load_scan_sets([scans], 1, reporter=listener)
+def test_view_and_inspect_project_by_elevation_and_say_so(folders, capsys, heard):
+    scans = str(folders / "shuffled")
+    (seen,) = load_scan_sets([scans], 1)
     assert seen.images.return_mask.float().mean() > 0.5
-    assert "not in firing order" in listener.lines[0]
+    assert "not in firing order" in heard[0]
     assert cli.main(["inspect", scans]) == 0
     captured = capsys.readouterr()
     assert "not in firing order" in captured.err

@@ -14,7 +14,6 @@ import torch
 from fsspec.implementations.local import LocalFileSystem
 
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.batches import Batches
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
@@ -30,14 +29,6 @@ from lidargrit.scans.sensors import load_sensor
 
 prepare_module = sys.modules[prepare_function.__module__]
 SIMULATED = DataConfig(workers=1)
-
-
-class Listener(Reporter):
-    def __init__(self):
-        self.lines = []
-
-    def message(self, text):
-        self.lines.append(text)
 
 
 @pytest.fixture(autouse=True)
@@ -149,18 +140,17 @@ def test_a_folder_prepared_from_what_has_changed_is_called_stale(tree, tmp_path)
         prepare(str(tree), config, tmp_path / "mine")
 
 
-def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache):
+def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache, heard):
     bad = KittiOdometry(tree).path(3)
     bad.write_bytes(b"")
     with pytest.raises(ScanError, match=r"leave such scans out by --set data.bad_scans=skip"):
         load(tree)
     assert not list(cache.rglob("*.shard"))
-    listener = Listener()
     config = DataConfig(bad_scans="skip")
-    images = load_range_images((str(tree),), config, listener)
+    images = load_range_images((str(tree),), config)
     assert len(images) == 4
     assert str(bad) not in images.provenance.names
-    assert [line for line in listener.lines if "left out" in line and str(bad) in line]
+    assert [line for line in heard if "left out" in line and str(bad) in line]
 
 
 def test_max_scans_are_spread_evenly(tree):
@@ -168,11 +158,10 @@ def test_max_scans_are_spread_evenly(tree):
     assert [name[-10:] for name in images.provenance.names] == ["000000.bin", KittiOdometry(tree).path(2).name]
 
 
-def test_a_sensor_with_fewer_lasers_than_the_scans_show_is_warned_of(tree):
-    listener = Listener()
+def test_a_sensor_with_fewer_lasers_than_the_scans_show_is_warned_of(tree, heard):
     config = DataConfig(train=(str(tree),), val=(), sensor="hdl32e", projection="spherical", max_scans=1)
-    load_range_images(config.train, config, listener)
-    (warning,) = (line for line in listener.lines if "WARNING" in line)
+    load_range_images(config.train, config)
+    (warning,) = (line for line in heard if "WARNING" in line)
     assert "imaged as hdl32e" in warning
     assert "points of two lasers" in warning
     assert "lidargrit fit-sensor" in warning

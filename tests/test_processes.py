@@ -14,7 +14,6 @@ import torch
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
@@ -251,9 +250,9 @@ def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
 def test_parts_that_cannot_be_are_refused(tmp_path):
     learn = TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=3)
     with pytest.raises(ConfigError, match="batch_size=4 on 1 processes in 3 parts each; wanted a multiple of 3"):
-        StageTraining(Plain(), learn, tmp_path, 0, Reporter())
+        StageTraining(Plain(), learn, tmp_path, 0)
     with pytest.raises(ConfigError, match="accumulate=2 for players who take turns"):
-        StageTraining(Game(), replace(learn, accumulate=2), tmp_path, 0, Reporter())
+        StageTraining(Game(), replace(learn, accumulate=2), tmp_path, 0)
     with pytest.raises(ConfigError, match="accumulate=0"):
         replace(learn, accumulate=0)
 
@@ -262,9 +261,7 @@ def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, monkeypatch):
     config = DataConfig(train=("simulated:4:train",), val=(), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
     learn = TrainingConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
-    fit = StageTraining(
-        Vqvae(load_preset("lidargrit_demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0, Reporter()
-    )
+    fit = StageTraining(Vqvae(load_preset("lidargrit_demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0)
     sizes = []
     monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
     assert fit.validate(images) == {"loss": 1.0}

@@ -16,7 +16,6 @@ import torch
 
 from lidargrit.core.errors import CheckpointError, OutputError, Terminated
 from lidargrit.core.files import read_json, read_tensors, write_json
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
@@ -42,7 +41,7 @@ def fit(folder, config=STEPS):
     torch.manual_seed(0)
     cls = load_class("r2dm")
     objective = cls(replace(cls.smallest_config(SENSOR), reflectance=False), SENSOR).objective("diffusion")
-    return StageTraining(objective, config, folder / "tokenizer", 0, Reporter())
+    return StageTraining(objective, config, folder / "tokenizer", 0)
 
 
 @pytest.fixture(scope="module")

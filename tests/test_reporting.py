@@ -4,15 +4,21 @@ import io
 import os
 import sys
 from contextlib import suppress
+from contextvars import copy_context
+from functools import partial
 from pathlib import Path
+from threading import Thread
 
 import pytest
 from rich.console import Console
 
+from lidargrit import cli
 from lidargrit.core import reporting
 from lidargrit.core.files import read_json
 from lidargrit.core.reporting import Schedule, TerminalReporter
+from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.run_folder import RUN_FILE
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.viewer.demo import _INTERRUPTED, _Clock
 
 
@@ -118,3 +124,27 @@ def test_a_full_disk_for_messages_ends_no_work(monkeypatch):
 def test_no_standard_error_is_no_error(monkeypatch):
     monkeypatch.setattr(sys, "stderr", None)
     TerminalReporter().message("a line")
+
+
+def test_only_the_inner_receiver_hears_a_piece_of_work_and_none_after_it(heard):
+    reporting.message("a line for the outer")
+    with suppress(ZeroDivisionError), reporting.to(reporting.Reporter()):
+        reporting.message("a line for nobody")
+        raise ZeroDivisionError
+    reporting.message("another for the outer")
+    assert heard == ["a line for the outer", "another for the outer"]
+
+
+def test_a_thread_is_silent_unless_it_has_a_copy_of_the_context(heard):
+    for work in (reporting.message, partial(copy_context().run, reporting.message)):
+        thread = Thread(target=work, args=(f"{type(work).__name__} in a thread",))
+        thread.start()
+        thread.join()
+    assert heard == ["partial in a thread"]
+
+
+def test_a_command_is_heard_and_a_call_of_the_library_is_not(tmp_path, capsys):
+    write_drives(tmp_path / "a", 1, DriveConfig(load_sensor("vlp16")))
+    assert capsys.readouterr().err == ""
+    assert cli.main(["simulate", str(tmp_path / "b"), "-n", "1", "--sensor", "vlp16"]) == 0
+    assert capsys.readouterr().err.startswith("simulating: 1/1")

@@ -13,7 +13,6 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.formats import read_scan
@@ -240,30 +239,22 @@ def test_a_condition_of_another_size_than_its_sensor_is_refused():
         Observed(range_m, known, known, known, K360.with_columns(64))
 
 
-class Heard(Reporter):
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-
-    def message(self, text: str) -> None:
-        self.messages.append(text)
-
-
 @pytest.mark.parametrize(("usual", "bright", "told"), [(0.6, 3.5, "by 1 in 5 scans"), (250, 300, "by 255 in 5 scans")])
-def test_a_bright_point_that_makes_its_scan_darker_is_told(tmp_path, usual, bright, told):
+def test_a_bright_point_that_makes_its_scan_darker_is_told(tmp_path, usual, bright, told, heard):
     scan = simulate(0, VLP16)
     for number in range(6):
         intensity = torch.linspace(0, usual, len(scan)).numpy()
         intensity[0] = bright if number == 5 else usual
         np.savez(tmp_path / f"{number}.npz", points=scan.points_xyz_m.numpy(), intensity=intensity)
-    config, heard = DataConfig(sensor="vlp16", columns=180, workers=1), Heard()
-    folder = prepare_and_describe(str(tmp_path), open_dataset(str(tmp_path)), config, tmp_path / "out", heard).folder
-    for said in (heard.messages, PreparedImages(str(folder)).remarks()):
+    config = DataConfig(sensor="vlp16", columns=180, workers=1)
+    folder = prepare_and_describe(str(tmp_path), open_dataset(str(tmp_path)), config, tmp_path / "out").folder
+    for said in (heard, PreparedImages(str(folder)).remarks()):
         (warning,) = (line for line in said if "reflectance" in line)
         assert f"divided {told} and by" in warning
         assert "in 1 scan, such as" in warning
         assert f"{tmp_path.name}/5.npz" in warning
     source = open_source(str(folder))
-    source.images(reporter=heard)
+    source.images()
     (doubt,) = source.doubts
     assert doubt in warning
     assert not PreparedImages(str(folder)).evenly_spaced(3).doubts(), "the first, the third and the fifth"

@@ -11,7 +11,6 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.settings import Preset, TrainingConfig
@@ -27,14 +26,6 @@ CONFIGS = {"lidargrit": LidarGritConfig, "maskgit": MaskGitConfig}
 FIT = TrainingConfig(scans=8, batch_size=4, learning_rate=0.1, average_over_scans=0)
 
 
-class Messages(Reporter):
-    def __init__(self):
-        self.lines = []
-
-    def message(self, text):
-        self.lines.append(text)
-
-
 def preset_of(generator, tokenizer):
     return Preset(
         title="a toy",
@@ -46,11 +37,11 @@ def preset_of(generator, tokenizer):
 
 
 @pytest.mark.parametrize("generator", CONFIGS)
-def test_a_second_tokenizer_trains_samples_and_is_scored_and_served(generator, tmp_path, monkeypatch, capsys):
+def test_a_second_tokenizer_trains_samples_and_is_scored_and_served(generator, tmp_path, monkeypatch, capsys, heard):
     toy, folder, samples = installed(monkeypatch), tmp_path / "run", tmp_path / "samples"
-    preset, heard = preset_of(generator, toy(noise_m=0.2)), Messages()
-    trained = train(preset, folder, heard)
-    assert any("this tokenizer is a toy" in line for line in heard.lines)
+    preset = preset_of(generator, toy(noise_m=0.2))
+    trained = train(preset, folder)
+    assert any("this tokenizer is a toy" in line for line in heard)
     assert float(trained.get_tokenizer().logits.detach().abs().max()) > 0, "it has learned"
     train(preset, folder)  # the same preset is recognised, and nothing is left to do
     with pytest.raises(OutputError, match=r"there model\.tokenizer\.noise_m=0\.2, here 0\.3"):

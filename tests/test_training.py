@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from lidargrit.core import configuration
+from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from lidargrit.core.files import claim_folder, read_tensors, write_json, write_tensors
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.batches import Batches
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
@@ -68,7 +67,7 @@ class StopAfterError(Exception):
     pass
 
 
-class StopAfter(Reporter):
+class StopAfter(reporting.Reporter):
     """Stops the training, as a kill would, when a stage has learned from so many scans."""
 
     def __init__(self, stage, scans):
@@ -120,8 +119,8 @@ def whole(tmp_path_factory):
 )
 def test_a_stopped_run_ends_with_the_same_bits_as_one_that_was_not(tmp_path, whole, name, stage, scans):
     preset = load_preset(name, PRESETS[name])
-    with pytest.raises(StopAfterError):
-        train(preset, tmp_path / "stopped", StopAfter(stage, scans))
+    with pytest.raises(StopAfterError), reporting.to(StopAfter(stage, scans)):
+        train(preset, tmp_path / "stopped")
     train(preset, tmp_path / "stopped")
     folders = whole(name), tmp_path / "stopped"
     unbroken, stopped = (read_tensors(folder / "model.safetensors")[0] for folder in folders)
@@ -196,7 +195,7 @@ def test_the_linear_schedule_is_the_programs(golden):
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
-    fit = StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0, Reporter())
+    fit = StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0)
     with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
         fit.run(images, images, "training")
     assert "checkpoint" not in str(error.value), "there is none yet"
@@ -217,7 +216,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
         scans=180, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=30, precision="auto",
         average_over_scans=20, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
-    fit = StageTraining(vqvae, learn, tmp_path, 0, Reporter())
+    fit = StageTraining(vqvae, learn, tmp_path, 0)
     fit.run(scan, scan, "training")
     learned = fit.validate(scan)
     assert learned["range_mae_m"] < 0.3

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from lidargrit.cli import main
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, Terminated
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.workers import _made_by_processes
@@ -70,14 +70,12 @@ def test_unmarked_surfaces_are_refused_before_any_stage():
 
 
 def test_validation_scans_are_looked_for_before_training_scans_are_projected(tmp_path):
-    class Projecting(Reporter):
+    class Projecting(reporting.Reporter):
         def progress(self, what, total, done=0):
             raise AssertionError(what)
 
-    with pytest.raises(DataError, match="nowhere"):
-        train(
-            load_preset("lidargrit_demo", [*TINY, f"data.val={tmp_path / 'nowhere'}"]), tmp_path / "run", Projecting()
-        )
+    with pytest.raises(DataError, match="nowhere"), reporting.to(Projecting()):
+        train(load_preset("lidargrit_demo", [*TINY, f"data.val={tmp_path / 'nowhere'}"]), tmp_path / "run")
 
 
 def test_a_validation_that_fails_leaves_the_checkpoint(tmp_path, monkeypatch):

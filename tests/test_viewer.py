@@ -15,7 +15,6 @@ from PIL import Image
 from lidargrit import simulate
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, OutputError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.formats import load as load_format
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.data.sources import open_source
@@ -140,16 +139,6 @@ def test_what_cannot_be_drawn_is_refused(images, tmp_path):
     assert not path.exists()
 
 
-class Listener(Reporter):
-    """Keeps what it is told."""
-
-    def __init__(self, lines: list[str]) -> None:
-        self.lines = lines
-
-    def message(self, text: str) -> None:
-        self.lines.append(text)
-
-
 def test_runs_compute_on_the_device_that_is_named(tmp_path):
     with pytest.raises(ConfigError, match="device 'cuda:99'"):
         load_scan_sets(["pretrained"], 1, device="cuda:99")
@@ -185,7 +174,7 @@ def test_a_picture_of_too_many_scans_names_the_page(tmp_path):
         view(["simulated:9"], tmp_path / "a.html", count=101)
 
 
-def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_nothing(tmp_path):
+def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_nothing(tmp_path, heard):
     samples = [tmp_path / f"a_run_{word}_reflectance_and_a_long_name" / "samples" for word in ("with", "without")]
     sensor = load_sensor("hdl64e_kitti_odometry").with_columns(128)
     model = load_class("memorised")(load_class("memorised").smallest_config(sensor), sensor)
@@ -195,10 +184,9 @@ def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_noth
         write_samples(model, tmp_path / "run", folder, range(2))
     sets = load_scan_sets([str(folder) for folder in samples], 1)
     assert [one.name[-12:] for one in sets] == ["/samples (1)", "/samples (2)"]
-    told = []
-    sets = load_scan_sets([str(samples[0]), "pretrained"], 1, reporter=Listener(told))
+    sets = load_scan_sets([str(samples[0]), "pretrained"], 1)
     assert [one.name for one in sets][1:] == ["pretrained: generated"]
-    assert any("pretrained: no reconstructions, for its sensor has other rays" in text for text in told)
+    assert any("pretrained: no reconstructions, for its sensor has other rays" in text for text in heard)
 
 
 @pytest.mark.parametrize(

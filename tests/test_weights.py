@@ -16,7 +16,6 @@ import pytest
 import torch
 
 from lidargrit.core.errors import WeightsError
-from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.metrics.shared.networks import weights as published_weights
 from lidargrit.evaluation.metrics.shared.networks.network import NETWORKS, load_network
@@ -63,14 +62,6 @@ def serve(monkeypatch, answer, length=None):
     monkeypatch.setattr(urllib.request.OpenerDirector, "open", reply)
 
 
-class Listener(Reporter):
-    def __init__(self):
-        self.lines = []
-
-    def message(self, text):
-        self.lines.append(text)
-
-
 def refused(published, data, tmp_path, match):
     """Read a file of these bytes: it must be refused in one line that says where the right one is."""
     path = tmp_path / "given"
@@ -106,12 +97,11 @@ def test_the_given_file_goes_first_then_the_folder_then_the_cache(cache, tmp_pat
     assert find_weights(FILE) == cache / "tiny.pth"
 
 
-def test_they_are_fetched_into_the_cache_once(cache, monkeypatch):
+def test_they_are_fetched_into_the_cache_once(cache, monkeypatch, heard):
     serve(monkeypatch, WHOLE, len(WHOLE))
-    listener = Listener()
-    assert find_weights(FILE, reporter=listener) == cache / "tiny.pth"
+    assert find_weights(FILE) == cache / "tiny.pth"
     assert (cache / "tiny.pth").read_bytes() == WHOLE
-    assert listener.lines == [
+    assert heard == [
         "fetching https://example.org/tiny.pth (free to use)",
         f"{cache / 'tiny.pth'}: SHA-256 {hashlib.sha256(WHOLE).hexdigest()}; none is known to compare it with",
     ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from leg import Leg, run_leg
 from packing import pack, unpack
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import LidarGritError
 
 _PRESET = "lidargrit_fine_wide"
@@ -48,4 +49,5 @@ def _main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(_main())
+    with reporting.to(reporting.TerminalReporter()):
+        sys.exit(_main())

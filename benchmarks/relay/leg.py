@@ -19,7 +19,6 @@ from streets import Streets, ValidationStreets, simulating
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import OutputError, Terminated
 from lidargrit.core.files import read_json, write_json
-from lidargrit.core.reporting import TerminalReporter
 from lidargrit.evaluation.upright_objects import kept_objects
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
@@ -145,9 +144,7 @@ def _fit(
     torch.manual_seed(seed)
     built_on = fingerprint(generator.objective("tokenizer")) if finished else ""
     objective, config, workers = generator.objective(stage), preset.settings_of(stage), preset.data.workers
-    return StageTraining(
-        objective, config, run / stage, seed, TerminalReporter(), built_on, workers, deadline_s=deadline_s
-    )
+    return StageTraining(objective, config, run / stage, seed, built_on, workers, deadline_s=deadline_s)
 
 
 @torch.no_grad()

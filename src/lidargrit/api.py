@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
-from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.formats.shared.arrays import Points, scan_from_points, scan_of
@@ -155,7 +154,7 @@ def evaluate(
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
     first, second = (_source(each, sensor) for each in (generated, reference))
-    return compare_pair(open_pair(first, second, settings, Reporter()), settings)
+    return compare_pair(open_pair(first, second, settings), settings)
 
 
 def _source(scans: str | Sequence[Points], sensor: SensorModel) -> Source:

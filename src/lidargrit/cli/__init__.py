@@ -11,7 +11,7 @@ from typing import Any
 
 from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
 from lidargrit.cli._signals import raising_on_signals
-from lidargrit.core import discovery
+from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import LidarGritError, Terminated, UsageError
 from lidargrit.core.version import __version__
 
@@ -52,7 +52,7 @@ def _run(words: list[str]) -> int:
         parser.print_help()
         return 0
     try:
-        with _refusing_unusable_paths():
+        with _refusing_unusable_paths(), reporting.to(reporting.TerminalReporter()):
             options.run(options)
             if sys.stdout is not None:  # closed by the caller
                 sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends

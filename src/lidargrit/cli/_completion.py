@@ -56,14 +56,13 @@ def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorMod
 
 def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:
     """Do a task with every scan, and say how many points came in and went out, and how to look at them."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.inference.complete.command import complete_scans
     from lidargrit.inference.complete.files import OutputConfig
 
     output = OutputConfig(options.count, options.seed, options.format, probability)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    found = complete_scans(options.scans, options.out, model, task, output, config, TerminalReporter())
+    found = complete_scans(options.scans, options.out, model, task, output, config)
     kind = {"complete": "completed", "upsample": "upsampled", "raydrop": "dropped"}[task.verb]
     print(f"done: {counted_scans(found.scans, kind)} in {options.out}{_points(found, task)}")
     print(f"look at {'it' if found.scans == 1 else 'them'}: {_view(options, found, model)}")

@@ -43,7 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the benchmark, write the table and its page, and print it."""
     from lidargrit.core.files import write_text
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.benchmark import as_json, as_table
     from lidargrit.evaluation.benchmark import run as run_benchmark
     from lidargrit.evaluation.table_folder import TABLE, write_table
@@ -51,7 +50,7 @@ def run(options: argparse.Namespace) -> None:
 
     refuse_taken(options, options.out / TABLE)
     systems, benchmark = wanted(options)
-    scores = run_benchmark(systems, options.out, benchmark, TerminalReporter(), options.processes)
+    scores = run_benchmark(systems, options.out, benchmark, options.processes)
     write_table(options.out, systems, benchmark, scores)
     write_text(options.out / "table.html", table_page(as_json(scores), benchmark.flops))
     done = f"done: {options.out / 'table.html'} sorts the table in a browser"

@@ -33,7 +33,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Complete, measure and print a table."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
     from lidargrit.inference.complete import is_classical, open_models
     from lidargrit.inference.complete.inputs import images_for, sensor_of
@@ -47,7 +46,6 @@ def run(options: argparse.Namespace) -> None:
     named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
     sensor = settings.data.imaged(sensor_of(options.scans, settings.sensor)) if named else None
     models = open_models(words, sensor, options.device)
-    reporter = TerminalReporter()
-    images = images_for(models, options.scans, settings, reporter)
-    scores = compare_completion(images, models, patterns, options.completions, options.seed, reporter)
+    images = images_for(models, options.scans, settings)
+    scores = compare_completion(images, models, patterns, options.completions, options.seed)
     print_result(options, as_table(scores), {"scans": options.scans, "scores": as_json(scores)})

@@ -35,7 +35,6 @@ def run(options: argparse.Namespace) -> None:
     """Simulate, compare, print a table and plot the curves."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.raydrop import raydrop_json, raydrop_model, raydrop_table, scores_of_model
     from lidargrit.evaluation.realism import as_json, as_table, compare, scans_of_both
     from lidargrit.viewer.curves import plot_curves
@@ -48,7 +47,7 @@ def run(options: argparse.Namespace) -> None:
     settings = scan_settings(options)
     about = {"real": options.real, "count": options.count, "sensor": settings.sensor, "fine": options.fine}
     simulated, real = scans_of_both(
-        options.real, options.count, settings.sensor, options.fine, options.seed, settings.data, TerminalReporter()
+        options.real, options.count, settings.sensor, options.fine, options.seed, settings.data
     )
     drops = scores_of_model(model, simulated, real) if model else []
     scores = compare(simulated, real)

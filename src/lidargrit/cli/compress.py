@@ -29,13 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compress the scans, and say how small they are."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.inference.compress.command import compress_scans
 
     refuse_to_overwrite(options.out, options.overwrite, ".lgz")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.out, options.model, options.step_mm)
-    found = compress_scans(*named, config, TerminalReporter())
+    found = compress_scans(*named, config)
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
     print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

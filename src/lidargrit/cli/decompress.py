@@ -28,9 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Restore the scans."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.inference.compress.command import decompress_scans
 
     named = (options.file, options.out, options.model, options.format, options.only)
-    count = decompress_scans(*named, TerminalReporter())
+    count = decompress_scans(*named)
     print(f"done: {counted_scans(count)} in {options.out}; decompressed.json says where they come from")

@@ -25,10 +25,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the demo and say where its results lie."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.datasets import root_of
     from lidargrit.viewer.demo import PAGE, demo
 
     out = options.out or Path("runs") / (f"demo-{root_of(options.data).resolve().name}" if options.data else "demo")
-    folder = demo(options.data, out, options.set, TerminalReporter(), options.anew)
+    folder = demo(options.data, out, options.set, options.anew)
     print(f"done: look at {folder / PAGE}; everything lies in {folder}")

@@ -42,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score and print a table."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.command import check_modes, evaluate, read_config
     from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.report import write_report
@@ -54,5 +53,5 @@ def run(options: argparse.Namespace) -> None:
     names = "protocol metrics variant max_scans seed samples_format device weights groups intervals pixel_statistics"
     config = read_config(scan_settings(options), **{name: vars(options)[name] for name in names.split()})
     sets, report = (options.samples, options.reference), (options.report, write_report, options.overwrite)
-    text, values, also = evaluate(*sets, config, TerminalReporter(), *report)
+    text, values, also = evaluate(*sets, config, *report)
     print_result(options, text, values, files_told(scores=options.json, report=options.report), also)

@@ -37,12 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.export import export_scans
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.scans.sensors import load_sensor
 
     sensor = load_sensor(options.sensor) if options.sensor else None
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = export_scans(options.source, options.out, options.format, config, TerminalReporter(), sensor)
+    count = export_scans(options.source, options.out, options.format, config, sensor)
     print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

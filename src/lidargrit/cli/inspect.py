@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
+    from lidargrit.core import reporting
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.sources.first_scan import first_scan
     from lidargrit.scans.projection.inspection import as_json, as_table, inspect
     from lidargrit.scans.projection.sensor_check import closest_sensor, projection_that_fits
@@ -39,7 +39,7 @@ def run(options: argparse.Namespace) -> None:
     name = settings.sensor or of_data_set or closest_sensor(scan)
     sensor, method = settings.data.imaged(load_sensor(name)), None
     if settings.data.projection == "sensor" and (method := projection_that_fits(scan, sensor)) != sensor.projection:
-        TerminalReporter().message("points that are not in firing order, so rows go by elevation")
+        reporting.message("points that are not in firing order, so rows go by elevation")
     found = inspect(scan, sensor, method, settings.data.projection_variant)
     if options.out:
         plot_inspection(found, options.out)

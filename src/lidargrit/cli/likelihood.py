@@ -34,7 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Count the bits and print a table."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.evaluation.likelihood import likelihood_of_source
 
@@ -43,6 +42,6 @@ def run(options: argparse.Namespace) -> None:
         refuse_to_overwrite(options.map, options.overwrite, ".npy")
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.model, options.step_mm)
-    found = likelihood_of_source(*named, config, TerminalReporter(), options.map, options.device)
+    found = likelihood_of_source(*named, config, options.map, options.device)
     result = {"model": options.model, "source": options.scans, **found.as_json()}
     print_result(options, found.as_table(), result)

@@ -34,7 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Prepare, and say what was made."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.prepare import prepare_and_describe
     from lidargrit.data.sources import open_source
 
@@ -43,6 +42,6 @@ def run(options: argparse.Namespace) -> None:
     settings = scan_settings(options, **{name: vars(options)[name] for name in names})
     dataset = open_source(options.source, settings.data.bad_points).scans()
     config = replace(settings.data, sensor=settings.sensor or dataset.sensor)
-    reporter, machines = TerminalReporter(), (options.rank, options.world_size)
-    made = prepare_and_describe(options.source, dataset, config, options.out, reporter, *machines, options.verify)
+    machines = options.rank, options.world_size
+    made = prepare_and_describe(options.source, dataset, config, options.out, *machines, options.verify)
     print_result(options, made.as_text(), made.to_json())

@@ -36,7 +36,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Reproduce the table, or print the plan."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.evaluation.benchmark import as_json
     from lidargrit.evaluation.reproduction import Reproduction, plan, plan_as_text, reproduce, table_of
 
@@ -53,5 +52,5 @@ def run(options: argparse.Namespace) -> None:
         facts = plan(wanted, options.out)
         print_result(options, plan_as_text(wanted, facts), facts)
         return
-    scores = reproduce(wanted, options.out, TerminalReporter())
+    scores = reproduce(wanted, options.out)
     print_result(options, table_of(wanted, scores, options.format), as_json(scores))

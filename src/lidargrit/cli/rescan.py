@@ -30,18 +30,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many rays of the wanted sensor get a point."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.export import export_scans
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.data.sources import open_source
     from lidargrit.scans.rescan import Rescan
     from lidargrit.scans.sensors import load_sensor
 
-    reporter, other = TerminalReporter(), load_sensor(options.to)
+    other = load_sensor(options.to)
     source = open_source(options.scans, options.bad_points)
     sensor = load_sensor(options.sensor) if options.sensor else source.sensor
     change = Rescan(sensor, other, options.raised_m)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = export_scans(options.scans, options.out, options.format, config, reporter, change=change)
+    count = export_scans(options.scans, options.out, options.format, config, change=change)
     look = f"lidargrit view {options.out} --sensor {options.to}"
     print(f"done: {counted_scans(count)} in {options.out}; look at them: {look}")

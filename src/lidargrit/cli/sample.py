@@ -35,7 +35,6 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from lidargrit.core.processes import rank_and_world_size
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
     from lidargrit.inference.samples import write_samples
@@ -49,5 +48,5 @@ def run(options: argparse.Namespace) -> None:
     generator = load(run_folder).to(device)
     sampling = generator.parse_sampling(options.set)
     seeds = seeds[rank::world_size]
-    write_samples(generator, run_folder, options.out, seeds, sampling, TerminalReporter())
+    write_samples(generator, run_folder, options.out, seeds, sampling)
     print(f"done: {counted_scans(len(seeds))} in {options.out}; look at them with: lidargrit view {options.out}")

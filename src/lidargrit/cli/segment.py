@@ -32,14 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Label the scans, and say where they are."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.inference.segment.command import segment_scans
 
     refuse_taken(options)
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.out, options.model)
-    count, scores = segment_scans(*named, config, TerminalReporter(), options.device, options.compare)
+    count, scores = segment_scans(*named, config, options.device, options.compare)
     found = scores.as_json() if scores else {}
     done = f"done: {counted_scans(count, 'labelled')} in {options.out}; see them with: lidargrit view {options.out}"
     result = {"source": options.scans, "model": options.model, "scans": count, **found}

@@ -40,7 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Simulate, and say where the files are."""
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.data.drives import DriveConfig, write_drives
     from lidargrit.scans.sensors import load_sensor
 
@@ -53,6 +52,6 @@ def run(options: argparse.Namespace) -> None:
         wet=options.wet,
         clean=options.clean,
     )
-    there = write_drives(options.out, options.num_scans, config, options.workers, TerminalReporter())
+    there = write_drives(options.out, options.num_scans, config, options.workers)
     theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
     print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Train, or print the plan."""
     from lidargrit.core.errors import ConfigError
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.generation.generator import load_class
     from lidargrit.generation.presets import load_preset
     from lidargrit.training import measure, open_data, plan_training, train
@@ -51,6 +50,6 @@ def run(options: argparse.Namespace) -> None:
         )
     from lidargrit.viewer import plot_progress  # matplotlib, which a plan does not need
 
-    train(preset, options.out, TerminalReporter(), plot_progress, options.wandb)
+    train(preset, options.out, plot_progress, options.wandb)
     command = load_class(preset.generator).facts.first_command.replace("RUN", str(options.out))
     print(f"done: the model lies in {options.out}; try it with: lidargrit {command}")

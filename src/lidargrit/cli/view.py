@@ -37,7 +37,6 @@ def run(options: argparse.Namespace) -> None:
     """Render the picture, or write the page."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.core.reporting import TerminalReporter
     from lidargrit.viewer import view
 
     if options.model and options.color != "surprise":
@@ -45,6 +44,6 @@ def run(options: argparse.Namespace) -> None:
             f"--model {options.model} with --color range", "--color surprise", "add it, or leave --model out"
         )
     refuse_to_overwrite(options.out, options.overwrite, ".png", ".html")
-    named = (options.places, options.out, options.count, options.seed, scan_settings(options), TerminalReporter())
+    named = (options.places, options.out, options.count, options.seed, scan_settings(options))
     view(*named, (options.model or "pretrained") if options.color == "surprise" else "", options.device)
     print(f"done: look at {options.out}")

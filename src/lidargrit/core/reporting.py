@@ -1,10 +1,18 @@
-"""Progress and messages of long work: silent by default, a progress bar on a terminal, lines in a log file."""
+"""Progress and messages of long work: silent by default, a progress bar on a terminal, lines in a log file.
+
+Whoever works reports by :func:`message` and :func:`progress`; whoever wants to hear it says so by :func:`to`.
+"""
 
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from typing import Any
+from contextlib import AbstractContextManager, contextmanager, suppress
+from contextvars import ContextVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 _SILENT_S_AT_MOST = 10.0  # between two lines of one piece of work, where there is no terminal
 _PRIOR_S = 10.0  # of expected work that counts as having taken as long as expected, so that first seconds mislead less
@@ -41,6 +49,42 @@ class Reporter:
     def of_process(self, name: str) -> "Reporter":
         """Return the reporter of one of several processes that work at the same time; its lines begin with a name."""
         return self
+
+
+_heard_by: ContextVar[Reporter] = ContextVar("reporter", default=Reporter())  # noqa: B039  it has no state
+
+
+@contextmanager
+def to(reporter: Reporter) -> Iterator[None]:
+    """Let a receiver have what is reported from here on, in this thread, in tasks of it, and in forks.
+
+    A new thread is silent until it is given a copy of the context (:func:`contextvars.copy_context`).
+    """
+    token = _heard_by.set(reporter)
+    try:
+        yield
+    finally:
+        _heard_by.reset(token)
+
+
+def current() -> Reporter:
+    """Return the receiver of what is reported here; a silent one outside of :func:`to`."""
+    return _heard_by.get()
+
+
+def message(text: str) -> None:
+    """Report one line."""
+    current().message(text)
+
+
+def expect(expected_s: Mapping[str, float]) -> None:
+    """Announce pieces of work to come with their expected seconds (:meth:`Reporter.expect`)."""
+    current().expect(expected_s)
+
+
+def progress(what: str, total: int, done: int = 0) -> AbstractContextManager[Progress]:
+    """Show how far a piece of work is and how long it will still take."""
+    return current().progress(what, total, done)
 
 
 class Schedule:
@@ -89,7 +133,11 @@ class TerminalReporter(Reporter):
     """Writes to standard error: bars on a terminal, a line every few seconds in a log file."""
 
     def __init__(self) -> None:
-        from rich.console import Console  # noqa: PLC0415  only the command line needs it
+        self._schedule = Schedule({})
+
+    @cached_property
+    def _console(self) -> "Console":
+        from rich.console import Console  # noqa: PLC0415  only a command that reports needs it
 
         class Silent(Console):
             """A console that falls silent when its reader has gone; rich's own would end the program."""
@@ -97,8 +145,7 @@ class TerminalReporter(Reporter):
             def on_broken_pipe(self) -> None:
                 self.quiet = True
 
-        self._console = Silent(file=sys.stderr, highlight=False, quiet=sys.stderr is None)
-        self._schedule = Schedule({})
+        return Silent(file=sys.stderr, highlight=False, quiet=sys.stderr is None)
 
     def message(self, text: str) -> None:
         """Say one line."""

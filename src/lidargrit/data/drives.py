@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, OutputError, counted_scans
 from lidargrit.core.files import (
     atomic_path,
@@ -19,7 +20,6 @@ from lidargrit.core.files import (
     write_text,
 )
 from lidargrit.core.processes import process_pool
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, scene_of
@@ -75,9 +75,7 @@ class DriveConfig:
         return {**vars(self), "sensor": self.sensor.to_json()}
 
 
-def write_drives(
-    out: Path, num_scans: int, config: DriveConfig, workers: int = 1, reporter: Reporter | None = None
-) -> int:
+def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1) -> int:
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
     The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
@@ -111,7 +109,7 @@ def write_drives(
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
         missing = [scan for scan in range(there) if not _label_file(out, config, scan).exists()]
         write = partial(_write_scan, out, config)
-        with (reporter or Reporter()).progress("simulating", there, there - len(missing)) as progress:
+        with reporting.progress("simulating", there, there - len(missing)) as progress:
             if min(workers, len(missing)) <= 1:
                 for scan in missing:
                     write(scan)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core import discovery
+from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError, one_of, printable
 from lidargrit.core.files import (
     atomic_path,
@@ -22,7 +22,6 @@ from lidargrit.core.files import (
     read_json,
     write_json,
 )
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.formats import ScanFormat
@@ -46,7 +45,6 @@ def export_scans(
     out: Path,
     kind: str,
     config: DataConfig | None = None,
-    reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
     change: Rescan | None = None,
 ) -> int:
@@ -75,10 +73,10 @@ def export_scans(
         DataError: no such source, or no usable scan in it.
         ScanError: a scan that cannot be used.
     """
-    config, reporter = config or DataConfig(), reporter or Reporter()
+    config = config or DataConfig()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
     scans, of_images = _open(source, config, sensor)
-    read = scans.scan if change is None else _View(scans, change, reporter)
+    read = scans.scan if change is None else _View(scans, change)
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     check_names(source, files)
@@ -86,19 +84,19 @@ def export_scans(
     facts["scans"] = {file: scans.identity(index) for index, file in enumerate(files)}
     with claim_folder(out), claimed_scans(out / MANIFEST, facts) as left_out:
         told_labels, missing = layout.keeps_labels, _missing(out, files)
-        told = _told_notes(source, scans.notes, set(), reporter)
-        with reporter.progress("exporting", len(files), len(files) - len(missing)) as progress:
+        told = _told_notes(source, scans.notes, set())
+        with reporting.progress("exporting", len(files), len(files) - len(missing)) as progress:
             for index in missing:
                 try:
                     layout.write(files[index], scan := read(index))
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
-                    reporter.message(f"left out: {error}")
+                    reporting.message(f"left out: {error}")
                     left_out.add(files[index])
                 else:
-                    told_labels = told_labels or tell_labels_lost(scan.label is not None, files[index], reporter)
-                    told = _told_notes(scan.source, scan.notes, told, reporter)
+                    told_labels = told_labels or tell_labels_lost(scan.label is not None, files[index])
+                    told = _told_notes(scan.source, scan.notes, told)
                 progress.advance(1)
         return _number_written(source, len(files), len(left_out))
 
@@ -112,8 +110,8 @@ def _number_written(source: str, files: int, left_out: int) -> int:
 class _View:
     """Scans as another sensor sees them; of the first one it tells how many rays get a point."""
 
-    def __init__(self, scans: NamedScans, change: Rescan, reporter: Reporter) -> None:
-        self._scans, self._change, self._reporter, self._told = scans, change, reporter, False
+    def __init__(self, scans: NamedScans, change: Rescan) -> None:
+        self._scans, self._change, self._told = scans, change, False
 
     def __call__(self, index: int) -> Scan:
         """Return one scan as the other sensor sees it."""
@@ -121,16 +119,16 @@ class _View:
         if not self._told:
             look = f"; {seen.without_rows:,} look where the scans have no rows" if seen.without_rows else ""
             points = f"{len(seen.scan):,} of {seen.rays:,} rays get a point of the first scan{look}"
-            self._reporter.message(f"{self._change.other.name}: {points}")
+            reporting.message(f"{self._change.other.name}: {points}")
             self._told = True
         return seen.scan
 
 
-def _told_notes(of: str, notes: Sequence[str], told: set[str], reporter: Reporter) -> set[str]:
+def _told_notes(of: str, notes: Sequence[str], told: set[str]) -> set[str]:
     """Report notes that were not told yet, and return all that were."""
     for note in notes:
         if note not in told:
-            reporter.message(f"{printable(of)}: {note}")
+            reporting.message(f"{printable(of)}: {note}")
     return told | {*notes}
 
 
@@ -156,10 +154,10 @@ def check_names(source: str, names: Sequence[str]) -> None:
         raise DataError(got, "a name for each scan, as each becomes a file", "rename some, or take their folders apart")
 
 
-def tell_labels_lost(lost: bool, file: str, reporter: Reporter) -> bool:
+def tell_labels_lost(lost: bool, file: str) -> bool:
     """Tell, if labels are lost, that a file by its ending keeps none; return whether it was told."""
     if lost:
-        reporter.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
+        reporting.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
     return lost
 
 

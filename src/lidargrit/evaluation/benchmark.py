@@ -14,11 +14,11 @@ from typing import Any
 
 import torch
 
+from lidargrit.core import reporting
 from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, LidarGritError
 from lidargrit.core.files import claim_folder, read_json, write_json
 from lidargrit.core.processes import check_processes, process_pool
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
 from lidargrit.data.sources import SampleSource, Source, TensorSource, data_set_of, open_source
@@ -94,7 +94,6 @@ def run(
     systems: Sequence[str],
     folder: Path,
     benchmark: Benchmark,
-    reporter: Reporter | None = None,
     processes: int = 1,
 ) -> list[Path]:
     """Train or load each system, sample from it and score the samples, and return the files of scores.
@@ -112,7 +111,6 @@ def run(
         ConfigError: a system that occurs twice, or a preset that does not take a setting.
         OutputError: another comparison writes into the folder, or it cannot be written to.
     """
-    reporter = reporter or Reporter()
     names = [_folder_name(system) for system in systems]
     if len(set(names)) < len(names) or not names:
         raise ConfigError(
@@ -127,20 +125,21 @@ def run(
     by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
-    _require_a_metric(benchmark.evaluation(), reporter)
-    _warn_of_bounds(plans, reference, reporter)
+    _require_a_metric(benchmark.evaluation())
+    _warn_of_bounds(plans, reference)
     processes = min(processes, len(by_run))  # more would only take cores from one another
-    remaining = _Remaining(list(systems), reporter)
+    remaining = _Remaining(list(systems))
     with claim_folder(folder):
-        _check_reference(reference, plans, benchmark, reporter)
+        _check_reference(reference, plans, benchmark)
         if processes == 1:
             for plan in chain.from_iterable(by_run.values()):
-                sampled = _finish([plan], folder, benchmark, reporter, reference)
+                sampled = _finish([plan], folder, benchmark, reference)
                 remaining.without([plan.system], sampled)
         else:
             with process_pool(processes, partial(_share, processes)) as pool:
+                heard_from = reporting.current().of_process
                 begun = {
-                    pool.submit(_finish, some, folder, benchmark, reporter.of_process(run.name)): some
+                    pool.submit(_finish_as_process, heard_from(run.name), some, folder, benchmark): some
                     for run, some in by_run.items()
                 }
                 for done in as_completed(begun):
@@ -150,12 +149,12 @@ def run(
     return paths
 
 
-def _require_a_metric(settings: EvalConfig, reporter: Reporter) -> None:
+def _require_a_metric(settings: EvalConfig) -> None:
     """Refuse metrics none of which can be made, as for want of weights, with the reason of the first."""
     errors = []
     for choice in settings.chosen_metrics():
         try:
-            metric_factory(choice, settings, reporter)()
+            metric_factory(choice, settings)()
         except LidarGritError as error:
             errors.append(error)
         else:
@@ -163,16 +162,16 @@ def _require_a_metric(settings: EvalConfig, reporter: Reporter) -> None:
     raise errors[0]
 
 
-def _check_reference(reference: Source, plans: "Sequence[_Plan]", benchmark: Benchmark, reporter: Reporter) -> None:
+def _check_reference(reference: Source, plans: "Sequence[_Plan]", benchmark: Benchmark) -> None:
     """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
     config = benchmark.evaluation().data_config()
     for sensor in {json.dumps(plan.sensor.to_json()): plan.sensor for plan in plans}.values():
-        images = reference.images(sensor, config, reporter)
+        images = reference.images(sensor, config)
         require_same_rays(sensor, images.sensor)
         images.batch([0])  # the size of a file is known once it is read
 
 
-def _warn_of_bounds(plans: "Sequence[_Plan]", reference: Source, reporter: Reporter) -> None:
+def _warn_of_bounds(plans: "Sequence[_Plan]", reference: Source) -> None:
     """Warn of rows that bound the scores of another data set than the reference's: theirs has to be trained on."""
     unclear = {"", "folder", data_set_of(reference.text)[0] or reference.data_set}  # a folder's may be any data set
     presets = {plan.system: plan.preset for plan in plans if plan.preset is not None}
@@ -183,55 +182,58 @@ def _warn_of_bounds(plans: "Sequence[_Plan]", reference: Source, reporter: Repor
         if preset.generator in (PIXEL_STATISTICS, MEMORISED) and data_set_of(source)[0] not in unclear
     }
     if others:
-        reporter.message(
+        reporting.message(
             f"WARNING: {' and '.join(others)} would learn from {' and '.join(sorted({*others.values()}))}, another "
             f"data set than that of {reference.text}, and bound no score against it; name scans of that data set with "
             "--set data.train=FOLDER data.val=FOLDER"
         )
 
 
-def _finish(
-    plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source | None = None
+def _finish_as_process(
+    reporter: reporting.Reporter, plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark
 ) -> int:
+    with reporting.to(reporter):
+        return _finish(plans, folder, benchmark)
+
+
+def _finish(plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark, reference: Source | None = None) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
     settings = benchmark.evaluation()
     reference = reference or open_source(benchmark.reference, settings.data.bad_points)
     for plan in plans:
         name = _folder_name(plan.system)
-        reporter.message(f"{name}:")
+        reporting.message(f"{name}:")
         if plan.samples is not None:
-            _score_samples(plan.samples, folder / name, benchmark, reporter, reference)
+            _score_samples(plan.samples, folder / name, benchmark, reference)
             continue
-        generator = (
-            load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run, reporter)
-        )
+        generator = load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run)
         generator.to(usable_device(""))
         samples = folder / name / "samples"
-        timed = _sample(generator, plan.run, samples, plan.sampling, benchmark, reporter)
+        timed = _sample(generator, plan.run, samples, plan.sampling, benchmark)
         sampled += timed is not None
         costs = Costs(folder / name / COSTS, weights_sha256(plan.run))
         costs.write(generator, plan.sampling, plan.preset, timed)
-        pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings, reporter), samples)
-        costs.add_bits(generator, pair.reference, reporter)
-        _score(pair, settings, folder / name / f"{name}.json", reporter)
-        _warn_of_limits(pair, benchmark, reporter)
+        pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings), samples)
+        costs.add_bits(generator, pair.reference)
+        _score(pair, settings, folder / name / f"{name}.json")
+        _warn_of_limits(pair, benchmark)
     return sampled
 
 
-def _score_samples(samples: Source, folder: Path, benchmark: Benchmark, reporter: Reporter, reference: Source) -> None:
+def _score_samples(samples: Source, folder: Path, benchmark: Benchmark, reference: Source) -> None:
     """Score samples that are there, of which neither the costs nor the training are known."""
     settings = benchmark.evaluation()
-    pair = open_pair(samples, reference, settings, reporter)
+    pair = open_pair(samples, reference, settings)
     if isinstance(samples, SampleSource):
         pair = _of_first_seeds(pair, samples.folder)
     folder.mkdir(parents=True, exist_ok=True)
     Costs(folder / COSTS, samples.weights_sha256()).write_unknown()
-    _score(pair, settings, folder / f"{folder.name}.json", reporter)
-    _warn_of_limits(pair, benchmark, reporter)
+    _score(pair, settings, folder / f"{folder.name}.json")
+    _warn_of_limits(pair, benchmark)
 
 
-def _warn_of_limits(pair: EvalPair, benchmark: Benchmark, reporter: Reporter) -> None:
+def _warn_of_limits(pair: EvalPair, benchmark: Benchmark) -> None:
     """Warn where fewer scans are compared than were asked for: systems of other numbers get another table."""
     compared, protocol = len(pair.samples), benchmark.settings.protocol
     if compared == benchmark.num_samples:
@@ -241,7 +243,7 @@ def _warn_of_limits(pair: EvalPair, benchmark: Benchmark, reporter: Reporter) ->
     else:
         few = pair.samples if len(pair.samples.images) == compared else pair.reference
         limit = f"{few.source} has"
-    reporter.message(f"WARNING: {limit} {compared:,} scans, so as many are compared; -n {compared} compares all alike")
+    reporting.message(f"WARNING: {limit} {compared:,} scans, so as many are compared; -n {compared} compares all alike")
 
 
 def _of_first_seeds(pair: EvalPair, folder: Path) -> EvalPair:
@@ -268,8 +270,8 @@ def _share(processes: int) -> None:
 class _Remaining:
     """Estimates how long the remaining systems take, each as long as the mean of those that were sampled just now."""
 
-    def __init__(self, systems: list[str], reporter: Reporter) -> None:
-        self._left, self._count, self._reporter = systems, len(systems), reporter
+    def __init__(self, systems: list[str]) -> None:
+        self._left, self._count = systems, len(systems)
         self._begun, self._sampled = time.monotonic(), 0
 
     def without(self, done: Sequence[str], sampled: int) -> None:
@@ -281,7 +283,7 @@ class _Remaining:
             if self._sampled:
                 each_s = (time.monotonic() - self._begun) / self._sampled
                 time_left = f", for about {duration(each_s * len(self._left))}"
-            self._reporter.message(
+            reporting.message(
                 f"{self._count - len(self._left)} of {self._count} systems are done; left{time_left}: "
                 f"{', '.join(self._left)}"
             )
@@ -338,17 +340,17 @@ class _Plan:
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: object, benchmark: Benchmark, reporter: Reporter
+    generator: Generator, run: Path, folder: Path, sampling: object, benchmark: Benchmark
 ) -> tuple[int, float] | None:
     """Sample what is not there yet, and return how many scans and the seconds for each; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
     begun = time.perf_counter()
-    write_samples(generator, run, folder, range(benchmark.num_samples), sampling, reporter)
+    write_samples(generator, run, folder, range(benchmark.num_samples), sampling)
     sampled = benchmark.num_samples - before
     return (sampled, (time.perf_counter() - begun) / sampled) if sampled > 0 else None
 
 
-def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter) -> None:
+def _score(pair: EvalPair, settings: EvalConfig, path: Path) -> None:
     """Score two sets and write the file, unless it holds the scores of the same images by the same settings.
 
     Scores that rest on weights of a network are computed again if these were not there, or were others.
@@ -358,13 +360,13 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path, reporter: Reporter)
     if path.is_file():
         there = Scorecard.read(path)
         known = (there.protocol, there.settings, there.samples, there.reference, there.versions.get("lidargrit"))
-        if known == wanted and not _has_other_weights(there, pair, settings, reporter):
-            reporter.message(f"scores are there already; remove {path} to score again")
+        if known == wanted and not _has_other_weights(there, pair, settings):
+            reporting.message(f"scores are there already; remove {path} to score again")
             return
-    write_json(path, compare_pair(pair, settings, reporter).to_json())
+    write_json(path, compare_pair(pair, settings).to_json())
 
 
-def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig, reporter: Reporter) -> bool:
+def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig) -> bool:
     """Return whether the networks of metrics have weights now that they had not when these scores were computed."""
     stored: dict[MetricChoice, Any] = {
         MetricChoice(each.metric, each.variant): None for each in there.left_out if each.verdict != NOT_APPLICABLE
@@ -377,7 +379,7 @@ def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig, r
         if not load_metric(choice.metric).needs_weights:  # what the same program left out of the same images stays so
             continue
         with suppress(LidarGritError):  # still no weights, or images that this network cannot see
-            metric = metric_factory(choice, settings, reporter)()
+            metric = metric_factory(choice, settings)()
             for images, real in ((pair.samples, False), (pair.reference, True)):
                 metric.update(images.batch([0]), real=real)  # some know only now which weights these images need
             if metric.weights_sha256 != (sha256 or ""):

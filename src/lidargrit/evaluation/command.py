@@ -6,10 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidargrit.core import discovery
+from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, nearest_names, one_of
 from lidargrit.core.files import refuse_to_overwrite
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import RunSource, SampleSource, Source, TensorSource, open_source
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
@@ -28,7 +27,6 @@ def evaluate(
     samples: str,
     reference: str,
     config: EvalConfig,
-    reporter: Reporter,
     report: Path | None = None,
     write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
     overwrite: bool = False,
@@ -59,12 +57,12 @@ def evaluate(
     second = open_source(reference, config.data.bad_points)
     if isinstance(first, RunSource):
         _refuse_options_of_samples(samples, config, report)
-        return *_reconstruction(first, second, config, reporter), None
+        return *_reconstruction(first, second, config), None
     _refuse_unused(first, config)
-    pair = open_pair(first, second, config, reporter)
-    card = compare_pair(pair, config, reporter)
+    pair = open_pair(first, second, config)
+    card = compare_pair(pair, config)
     for warning in card.warnings[len(pair.warnings) :]:
-        reporter.message(f"WARNING: {warning}")
+        reporting.message(f"WARNING: {warning}")
     also = partial(write_report, card, pair, report) if report and write_report else None
     return card.as_table(), card.to_json(), also
 
@@ -190,12 +188,10 @@ def _refuse_unused(samples: Source, config: EvalConfig) -> None:
         )
 
 
-def _reconstruction(
-    run: RunSource, reference: Source, config: EvalConfig, reporter: Reporter
-) -> tuple[str, dict[str, Any]]:
+def _reconstruction(run: RunSource, reference: Source, config: EvalConfig) -> tuple[str, dict[str, Any]]:
     variant = config.projection_variant or run.projection_variant(config.data) or "exact"
     data = replace(config.data, max_scans=config.max_scans, projection_variant=variant)
-    errors = score_run(run, reference, data, reporter, config.device)
+    errors = score_run(run, reference, data, config.device)
     about = {"samples": run.text, "reference": reference.text, "projection_variant": variant}
     table = "\n".join(f"{name:<22}{value:>10.4g}" for name, value in errors.items())
     return table, {**about, "reconstruction": errors}

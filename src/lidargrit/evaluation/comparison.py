@@ -7,8 +7,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, LidarGritError, nearest_names, one_of
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
@@ -123,61 +123,56 @@ class EvalConfig:
         }
 
 
-def compare_sources(
-    samples: str, reference: str, settings: EvalConfig | None = None, reporter: Reporter | None = None
-) -> tuple[Scorecard, EvalPair]:
+def compare_sources(samples: str, reference: str, settings: EvalConfig | None = None) -> tuple[Scorecard, EvalPair]:
     """Score a folder of samples, or any source of scans, against another.
 
     Args:
         samples: name of a folder of samples, of ours or of another program, or of any source of scans.
         reference: name of the second set; its scans are projected with the sensor of the samples.
         settings: protocol and its changes.
-        reporter: receiver of progress and warnings.
 
     Raises:
         ConfigError: the two sets look along different rays, or a setting is out of its bounds.
         UnknownNameError: no such protocol or metric.
         LidarGritError: not one metric could be computed; what the first said.
     """
-    settings, reporter = settings or EvalConfig(), reporter or Reporter()
+    settings = settings or EvalConfig()
     first = open_source(samples, settings.data.bad_points, settings.samples_format)
-    pair = open_pair(first, open_source(reference, settings.data.bad_points), settings, reporter)
-    return compare_pair(pair, settings, reporter), pair
+    pair = open_pair(first, open_source(reference, settings.data.bad_points), settings)
+    return compare_pair(pair, settings), pair
 
 
-def open_pair(samples: Source, reference: Source, settings: EvalConfig, reporter: Reporter) -> EvalPair:
+def open_pair(samples: Source, reference: Source, settings: EvalConfig) -> EvalPair:
     """Read the two sets of an evaluation, and warn where they are not comparable."""
     protocol, config = load_protocol(settings.protocol), settings.data_config()
     sensor = load_sensor(settings.sensor) if settings.sensor else protocol.load_sensor()
     if sensor is None and (settings.data.columns or settings.data.projection != "sensor"):
         sensor = samples.sensor  # named for prepared scans and .npy, which else keep their own columns and projection
     sensor = sensor and config.imaged(sensor)
-    pair = pair_for_protocol(samples, reference, protocol, config, reporter, sensor)
+    pair = pair_for_protocol(samples, reference, protocol, config, sensor)
     for warning in filter(None, (*pair.warnings, pair.leak)):
         if warning not in (*samples.doubts, *reference.doubts):  # which were told when the scans were opened
-            reporter.message(f"WARNING: {warning}")
+            reporting.message(f"WARNING: {warning}")
     return pair
 
 
 def compare_pair(
     pair: EvalPair,
     settings: EvalConfig,
-    reporter: Reporter | None = None,
 ) -> Scorecard:
     """Score two opened sets.
 
     Args:
         pair: the two sets.
         settings: protocol and its changes.
-        reporter: receives the progress.
 
     Raises:
         LidarGritError: not one metric could be computed; the reason of the first.
     """
-    reporter, protocol = reporter or Reporter(), load_protocol(settings.protocol)
+    protocol = load_protocol(settings.protocol)
     wanted, not_applicable = _applicable(settings.chosen_metrics(), pair)
-    factories = [metric_factory(choice, settings, reporter) for choice in wanted]
-    found = score_metrics(factories, pair, settings.resampling, reporter, settings.pixel_statistics)
+    factories = [metric_factory(choice, settings) for choice in wanted]
+    found = score_metrics(factories, pair, settings.resampling, settings.pixel_statistics)
     scores = [score for score in found if isinstance(score, Score)]
     errors = [error for error in found if isinstance(error, LidarGritError)]
     left_out = [
@@ -253,10 +248,10 @@ def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
         raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
 
 
-def metric_factory(choice: MetricChoice, settings: EvalConfig, reporter: Reporter) -> MetricFactory:
+def metric_factory(choice: MetricChoice, settings: EvalConfig) -> MetricFactory:
     """Return what makes empty metrics of one definition, by the settings of an evaluation."""
     weights = settings.weights.get(load_metric(choice.metric).needs_weights)
-    return MetricFactory(choice, settings.seed, weights, settings.device, reporter)
+    return MetricFactory(choice, settings.seed, weights, settings.device)
 
 
 def _doubts(scores: Sequence[Score], settings: EvalConfig) -> list[str]:

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, DataError, UsageError, counted_scans
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.metrics import load_metric
@@ -80,7 +80,6 @@ def compare_completion(
     patterns: Sequence[Pattern],
     completions: int = 2,
     seed: int = 0,
-    reporter: Reporter | None = None,
 ) -> list[CompletionScore]:
     """Hide parts of scans, have every model fill them in, and compare.
 
@@ -99,16 +98,15 @@ def compare_completion(
         DataError: no scan.
         UsageError: a pattern that hides no return, so that there is nothing to compare.
     """
-    reporter = reporter or Reporter()
     if not len(images) or completions < 1:
         raise DataError(
             f"{counted_scans(len(images))}, {completions} completions of each", "at least 1 of both", "raise the number"
         )
     for model in models:
-        _check(model, images, reporter)
+        _check(model, images)
     whole = images.batch(range(len(images)))
     scores = []
-    with reporter.progress("completing", len(patterns) * len(models)) as progress:
+    with reporting.progress("completing", len(patterns) * len(models)) as progress:
         for pattern in patterns:
             masks = [pattern.mask(whole[index], derive_seed(seed, index)) for index in range(len(whole))]
             if not bool((whole.return_mask.cpu() & ~torch.stack(masks)).any()):
@@ -165,7 +163,7 @@ class _OfPattern:
     errors_m: list[float]
 
 
-def _check(model: Model, images: RangeImages, reporter: Reporter) -> None:
+def _check(model: Model, images: RangeImages) -> None:
     if not model.sensor.same_rays(images.sensor):
         raise ConfigError(
             f"the model {model.name} of {model.sensor.name!r}",
@@ -173,7 +171,7 @@ def _check(model: Model, images: RangeImages, reporter: Reporter) -> None:
             "compare models of one sensor",
         )
     if shared := model.learned_from().overlap(images.provenance):
-        reporter.message(f"WARNING: {model.name} and the scans overlap ({shared}): the scores flatter it")
+        reporting.message(f"WARNING: {model.name} and the scans overlap ({shared}): the scores flatter it")
 
 
 def _score(

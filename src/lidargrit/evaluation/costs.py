@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.files import read_json, write_json
-from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.tables import TableBlock
@@ -75,12 +75,11 @@ class Costs:
         """Write that nothing is known of the costs, as of samples that were there."""
         write_json(self.path, {"weights_sha256": self.weights_sha256, **dict.fromkeys(_ENTRIES), "scans": 0})
 
-    def add_bits(self, generator: Generator, scans: EvalSet, reporter: Reporter) -> None:
+    def add_bits(self, generator: Generator, scans: EvalSet) -> None:
         """Add the bits a return of the reference to the file, unless those of the same scans are there.
 
         Args:
             scans: the reference.
-            reporter: receiver of the reason where the system has no likelihood of these scans.
         """
         costs = read_costs(self.path)
         reference = {"sha256": scans.record().sha256, "range_m": list(scans.range_m or ())}
@@ -89,7 +88,7 @@ class Costs:
         try:
             bits = bits_per_return(generator, scans)
         except ConfigError as error:  # scans that the model cannot encode can still be compared with
-            reporter.message(f"no likelihood of the reference: {error}")
+            reporting.message(f"no likelihood of the reference: {error}")
             bits = None
         write_json(self.path, {**costs, "bits_per_return": bits, "reference": reference})
 

@@ -8,10 +8,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
@@ -102,7 +102,6 @@ def score_likelihood(
     generator: Generator,
     images: RangeImages,
     step_mm: int = 10,
-    reporter: Reporter | None = None,
     maps: Path | None = None,
 ) -> Likelihood:
     """Return the bits of all images of a set; every scan is coded by itself.
@@ -119,7 +118,7 @@ def score_likelihood(
     parts: dict[str, list[float]] = {}
     sensor, returns, whole = images.sensor, [], False
     size = (len(images), sensor.height, sensor.width)
-    with _maps(maps, size) as pixels, (reporter or Reporter()).progress("scans", len(images)) as progress:
+    with _maps(maps, size) as pixels, reporting.progress("scans", len(images)) as progress:
         for bits in _bits(generator, images, range(len(images)), step_mm):
             for name, values in bits.per_scan().items():
                 parts.setdefault(name, []).extend(values.tolist())
@@ -175,7 +174,6 @@ def likelihood_of_source(
     model: str,
     step_mm: int,
     config: DataConfig,
-    reporter: Reporter,
     maps: Path | None = None,
     device: str = "",
 ) -> Likelihood:
@@ -184,7 +182,6 @@ def likelihood_of_source(
     Args:
         text: source of scans.
         model: finished run; scans are projected with its sensor, in the way of its training.
-        reporter: receiver of progress, and of a warning if the model has learned from these scans.
         maps: file to write the bits of every pixel to; none if not given.
 
     Raises:
@@ -196,10 +193,10 @@ def likelihood_of_source(
     config = replace(config, projection_variant=variant)
     generator = load(run.folder).to(usable_device(device))
     source = open_source(text, config.bad_points)
-    images = source.images(run.sensor, config, reporter)
+    images = source.images(run.sensor, config)
     if isinstance(source, DatasetSource):
         with suppress(ScanError):  # of a first scan that was left out, and told of
-            reporter.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))
+            reporting.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))
     if shared := overlap(run, None, images):
-        reporter.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")
-    return score_likelihood(generator, images, step_mm, reporter, maps)
+        reporting.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")
+    return score_likelihood(generator, images, step_mm, maps)

@@ -7,7 +7,6 @@ from functools import cached_property
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import DatasetSource, SampleSource, Source, overlap
@@ -124,7 +123,6 @@ def pair_for_protocol(
     reference: Source,
     protocol: Protocol,
     config: DataConfig,
-    reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
 ) -> EvalPair:
     """Read two sets as a protocol wants them.
@@ -139,15 +137,15 @@ def pair_for_protocol(
     Raises:
         ConfigError: the two sets look along different rays.
     """
-    reporter, sensor = reporter or Reporter(), sensor or protocol.load_sensor()
+    sensor = sensor or protocol.load_sensor()
     config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))
-    first = _Opened.of(samples, sensor, config, reporter)
+    first = _Opened.of(samples, sensor, config)
     if isinstance(samples, DatasetSource):  # whose points may have had to go by elevation: then so do the reference's
         config = replace(config, projection_variant=first.projection_variant)
-    second = _Opened.of(reference, first.images.sensor, config, reporter)
+    second = _Opened.of(reference, first.images.sensor, config)
     if isinstance(samples, DatasetSource) and second.images.sensor.projection != first.images.sensor.projection:
         config = replace(config, projection_variant=second.projection_variant)
-        first = _Opened.of(samples, second.images.sensor, config, reporter)
+        first = _Opened.of(samples, second.images.sensor, config)
     require_same_rays(first.images.sensor, second.images.sensor)
     count = min(len(first.images), len(second.images), config.max_scans or len(first.images))
     pair = EvalPair(first.as_set(count, protocol.range_m), second.as_set(count, protocol.range_m))
@@ -170,8 +168,8 @@ class _Opened:
     doubts: tuple[str, ...]
 
     @classmethod
-    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig, reporter: Reporter) -> "_Opened":
-        images = source.images(sensor, config, reporter)
+    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig) -> "_Opened":
+        images = source.images(sensor, config)
         return cls(source, images, source.projection_variant(config), source.doubts)
 
     def as_set(self, count: int, range_m: tuple[float, float] | None) -> EvalSet:

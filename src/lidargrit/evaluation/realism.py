@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
@@ -130,7 +130,6 @@ def scans_of_both(
     fine: bool = False,
     seed: int = 0,
     config: DataConfig | None = None,
-    reporter: Reporter | None = None,
 ) -> tuple[SimulatedScans, RangeImages]:
     """Simulate scans, and open the real scans that they are compared with.
 
@@ -143,16 +142,16 @@ def scans_of_both(
     if count < 2 or seed < 0:
         got = f"{counted_scans(count)} from seed {seed}"
         raise ConfigError(got, "at least 2, and no negative seed", "correct the number")
-    config, reporter = config or DataConfig(), reporter or Reporter()
+    config = config or DataConfig()
     scans = open_source(source, config.bad_points)
     firing = load_sensor(sensor) if sensor else scans.sensor
     rays = config.imaged(firing)
     rays = rays.fine() if fine else rays
-    real = scans.images(rays, replace(config, max_scans=min(count, config.max_scans or count)), reporter)
+    real = scans.images(rays, replace(config, max_scans=min(count, config.max_scans or count)))
     _require_two(real)
     rays = real.sensor
     pairs = []
-    with reporter.progress("simulating", count) as progress:
+    with reporting.progress("simulating", count) as progress:
         for each in range(seed, seed + count):
             pairs.append(simulate_pair(each, rays, firing))
             progress.advance(1)

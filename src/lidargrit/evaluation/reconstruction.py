@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import RunSource, Source, overlap
@@ -216,24 +216,21 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
     return score.compute()
 
 
-def score_run(
-    run: RunSource, source: Source, config: DataConfig, reporter: Reporter, device: str = "cpu"
-) -> dict[str, float]:
+def score_run(run: RunSource, source: Source, config: DataConfig, device: str = "cpu") -> dict[str, float]:
     """Return how well the tokenizer of a finished run reconstructs scans, by the name of each error.
 
     Args:
         run: finished run.
         source: scans that the tokenizer encodes and decodes.
-        reporter: receiver of progress, and of a warning if the model has learned from these scans.
 
     Raises:
         ConfigError: a run whose generator has no tokenizer.
     """
     generator = load(run.folder).to(device)
     tokenizer = generator.get_tokenizer()
-    images = source.images(run.sensor, config, reporter)
+    images = source.images(run.sensor, config)
     if shared := overlap(run, None, images):
-        reporter.message(f"WARNING: {run.text} and the reference overlap ({shared}): the scores flatter it")
+        reporting.message(f"WARNING: {run.text} and the reference overlap ({shared}): the scores flatter it")
     errors = asdict(score_reconstruction(tokenizer, images))
     if "likelihood" not in generator.capabilities:
         return errors

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.evaluation.benchmark import Benchmark, as_table
@@ -160,7 +159,7 @@ class Reproduction:
         return f"{self.table.data_set}:{self.root}:{split}"
 
 
-def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = None) -> list[Path]:
+def reproduce(wanted: Reproduction, folder: Path) -> list[Path]:
     """Prepare, train, sample and score every row, and return the files of scores.
 
     Args:
@@ -171,10 +170,9 @@ def reproduce(wanted: Reproduction, folder: Path, reporter: Reporter | None = No
     Raises:
         DataError: the root does not hold the data set, or a split of it.
     """
-    reporter = reporter or Reporter()
     benchmark, systems = wanted.benchmark(), wanted.systems()
-    _prepare(benchmark, list(systems.values()), reporter)
-    return run_benchmark(list(systems.values()), folder, benchmark, reporter)
+    _prepare(benchmark, list(systems.values()))
+    return run_benchmark(list(systems.values()), folder, benchmark)
 
 
 def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") -> str:
@@ -215,12 +213,12 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
     return "\n".join([*lines, "", *_remarks(wanted)])
 
 
-def _prepare(benchmark: Benchmark, systems: list[str], reporter: Reporter) -> None:
+def _prepare(benchmark: Benchmark, systems: list[str]) -> None:
     """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
     open_source(benchmark.reference)  # refuses a split that is not there
     for data in [benchmark.preset(system).data for system in systems]:
-        load_range_images(data.train, data, reporter)
-        load_range_images(data.val, data, reporter)
+        load_range_images(data.train, data)
+        load_range_images(data.val, data)
 
 
 def _remarks(wanted: Reproduction) -> list[str]:

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import DataError, LidarGritError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.metrics import Metric, WholeImages, load_metric, update_together
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
@@ -31,7 +31,6 @@ class MetricFactory:
     seed: int = 0
     weights: Path | None = None
     device: str = "cpu"
-    reporter: Reporter | None = None
 
     def __call__(self) -> Metric[Any, Any]:
         """Return an empty metric.
@@ -44,7 +43,7 @@ class MetricFactory:
         cls = load_metric(self.choice.metric)
         options: dict[str, Any] = {"variant": self.choice.variant or None, "seed": self.seed}
         if cls.needs_weights:
-            options |= {"weights": self.weights, "device": self.device, "reporter": self.reporter}
+            options |= {"weights": self.weights, "device": self.device}
         return cls(**options)
 
 
@@ -93,7 +92,6 @@ def score_metrics(
     factories: Sequence[MetricFactory],
     pair: EvalPair,
     resampling: Resampling,
-    reporter: Reporter | None = None,
     with_pixel_statistics: bool = False,
 ) -> list[Score | LidarGritError]:
     """Score two sets by several metrics.
@@ -123,7 +121,7 @@ def score_metrics(
         else:
             together.setdefault(index if isinstance(extractor, WholeImages) else extractor, []).append(index)
     sets = 3 if with_pixel_statistics else 2
-    with (reporter or Reporter()).progress("scoring", sets * len(pair.samples) * len(factories)) as progress:
+    with reporting.progress("scoring", sets * len(pair.samples) * len(factories)) as progress:
         for indices in together.values():
             fed = {index: _FedMetric(factories[index]) for index in indices}
             note = ", ".join(factories[index].choice.metric for index in indices)

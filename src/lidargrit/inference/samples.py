@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lidargrit.core import configuration
+from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import OutputError
 from lidargrit.core.files import (
     atomic_path,
@@ -23,7 +23,6 @@ from lidargrit.core.files import (
     write_json,
     write_text,
 )
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, trained_on_file, weights_sha256
 from lidargrit.data.sources.samples import MANIFEST, is_sample_folder
 from lidargrit.generation.generator import Generator, SamplingT
@@ -36,7 +35,6 @@ def write_samples(
     folder: Path,
     seeds: Sequence[int],
     sampling: SamplingT | None = None,
-    reporter: Reporter | None = None,
 ) -> None:
     """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.
 
@@ -67,7 +65,7 @@ def write_samples(
     images = generator.stream(missing, sampling)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
-        (reporter or Reporter()).progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
+        reporting.progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
     ):
         first = list(islice(images, 1))  # what the model refuses is told before anything is written
         if missing and not begun:

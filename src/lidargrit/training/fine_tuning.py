@@ -4,9 +4,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import PRETRAINED
 from lidargrit.data.sources import open_source
@@ -20,7 +20,7 @@ _TIMES_OF_DEMO = 10  # as many scans seen as the demo's preset says, where there
 _ENOUGH_SCANS = 400  # for all of these; fewer scans are seen in proportion, but no fewer than the demo's preset says
 
 
-def divided(data: str, reporter: Reporter, max_scans: int = 0) -> DataConfig:
+def divided(data: str, max_scans: int = 0) -> DataConfig:
     """Divide a user's scans into train and val, by whole drives where there are several.
 
     The same drive in both would leak. Held out is the drive that is nearest to 15 % of the scans; where there is only
@@ -45,14 +45,14 @@ def divided(data: str, reporter: Reporter, max_scans: int = 0) -> DataConfig:
             f"{data} with a share", "whole drives, or a folder", "leave the brackets out: the scans are divided here"
         )
     else:
-        reporter.message(
+        reporting.message(
             "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
         )
         train, val = f"{source}:{split}[:85%]", f"{source}:{split}[85%:]"
     return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=max_scans)
 
 
-def fine_tuning_preset(data: str, reporter: Reporter, sensor: str = "", settings: Sequence[str] = ()) -> Preset:
+def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()) -> Preset:
     """Return the preset that trains all networks of ``pretrained`` further on a user's scans.
 
     Stages and learning rates are those of ``lidargrit_demo_fine_tuned``. Scans seen grow with the number of scans that
@@ -61,11 +61,10 @@ def fine_tuning_preset(data: str, reporter: Reporter, sensor: str = "", settings
 
     Args:
         data: name of a data set, or of a folder of scans.
-        reporter: receiver of a warning where train and val may show the same streets.
         sensor: name or ``.json`` file of the sensor that made the scans; that of the data set if empty.
         settings: changed settings of the preset, as ``--set`` takes them.
     """
-    config = divided(data, reporter)
+    config = divided(data)
     own, made_by = load(PRETRAINED).sensor, load_sensor(sensor or config.sensor)
     if made_by.height != own.height:
         raise ConfigError(

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lidargrit.core import configuration
+from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import DatasetSource, PreparedSource, open_to_train
@@ -110,7 +110,8 @@ def open_data(preset: Preset) -> OpenedData:
     opened = OpenedData(open_to_train(preset.data.train, preset.data), open_to_train(preset.data.val, preset.data))
     for source in (*opened.train, *opened.val):
         if isinstance(source, PreparedSource):
-            source.images(preset.data.load_sensor(), preset.data)
+            with reporting.to(reporting.Reporter()):  # training says it when it opens them
+                source.images(preset.data.load_sensor(), preset.data)
     return opened
 
 

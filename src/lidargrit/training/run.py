@@ -13,11 +13,10 @@ from typing import Any
 
 import torch
 
-from lidargrit.core import configuration
+from lidargrit.core import configuration, reporting
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import CheckpointError, OutputError
 from lidargrit.core.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.version import __version__
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, preset_settings, trained_on, write_trained_on
@@ -43,7 +42,6 @@ PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 def train(
     preset: Preset,
     folder: Path,
-    reporter: Reporter | None = None,
     plot: PlotProgress | None = None,
     wandb_project: str = "",
 ) -> Generator:
@@ -57,7 +55,6 @@ def train(
     Args:
         preset: experiment to train.
         folder: run folder.
-        reporter: receiver of progress and messages.
         plot: function that plots the progress, called every ``pictures_every`` scans of a stage.
         wandb_project: project of Weights & Biases that is told of the run, too; "" for none.
 
@@ -68,8 +65,9 @@ def train(
         ConfigError: a stage to be taken from another run has other settings or another sensor than the preset.
     """
     engine = Engine("fp32")  # tells which of several processes is the first, the only one that writes
-    reporter = reporter if reporter and engine.rank == 0 else Reporter()
     with ExitStack() as held, engine.lost_processes_reported():
+        if engine.rank:
+            held.enter_context(reporting.to(reporting.Reporter()))
         engine.by_first(lambda: check_folder(folder, preset))
         checked = check_stages(preset, engine.world_size)
         opened = open_data(preset)
@@ -78,7 +76,7 @@ def train(
         begun = claimed_manifest(folder / RUN_FILE, folder / TRAINED_ON_FILE)
         engine.by_first(lambda: held.enter_context(begun))
         engine.by_first(lambda: held.enter_context(tracked(wandb_project, preset, folder)))
-        return _train(preset, checked, opened, folder, reporter, plot, engine)
+        return _train(preset, checked, opened, folder, plot, engine)
 
 
 def _train(
@@ -86,13 +84,12 @@ def _train(
     checked: CheckedStages,
     opened: OpenedData,
     folder: Path,
-    reporter: Reporter,
     plot: PlotProgress | None,
     engine: Engine,
 ) -> Generator:
-    train_images = joined_images(opened.train, preset.data, reporter)
-    val_images = joined_images(opened.val, preset.data, reporter)
-    _warn_of_overlap(train_images, val_images, reporter)
+    train_images = joined_images(opened.train, preset.data)
+    val_images = joined_images(opened.val, preset.data)
+    _warn_of_overlap(train_images, val_images)
     checked.check_images("data.train", train_images)
     checked.check_images("data.val", val_images)
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
@@ -108,9 +105,7 @@ def _train(
                 objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = preset.data.workers, preset.settings_of(stage)
-            return StageTraining(
-                objective, config, folder / stage, seed, reporter, built_on, workers, checked.told, picture
-            )
+            return StageTraining(objective, config, folder / stage, seed, built_on, workers, checked.told, picture)
 
         built_on = ""
         for number, stage in enumerate(generator.stages):
@@ -220,9 +215,9 @@ def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None
     )
 
 
-def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages, reporter: Reporter) -> None:
+def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages) -> None:
     if shared := train_images.provenance.overlap(val_images.provenance):
-        reporter.message(f"WARNING: train and val overlap ({shared}): scores on val flatter the model")
+        reporting.message(f"WARNING: train and val overlap ({shared}): scores on val flatter the model")
 
 
 def _commit() -> str:

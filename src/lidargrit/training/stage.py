@@ -12,10 +12,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, evenly_spaced
 from lidargrit.core.errors import ConfigError, Terminated, TrainingError
 from lidargrit.core.files import remove_partials
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import CHECKPOINT_FILE
@@ -52,7 +52,6 @@ class StageTraining:
     config: TrainingConfig
     folder: Path
     seed: int
-    reporter: Reporter
     built_on: str = ""
     workers: int = 1
     condition: ToldOfScans = field(default_factory=NothingTold)
@@ -102,7 +101,7 @@ class StageTraining:
             self.condition.of,
         )
         begun = time.monotonic()
-        progress_bar = self.reporter.progress(what, config.scans, self.scans_seen)
+        progress_bar = reporting.progress(what, config.scans, self.scans_seen)
         with Termination(self.deadline_s) as termination, progress_bar as progress:
             if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
                 self._log_terms("val", self.validate(val, termination), 0.0)
@@ -194,9 +193,9 @@ class StageTraining:
         self.engine.by_first(lambda: self.log.write(split, self.scans_seen, seconds, terms))
         if split == "val":
             losses = "  ".join(f"{name} {value:.4g}" for name, value in terms.items())
-            self.reporter.message(f"  after {self.scans_seen} scans, on val: {losses}")
+            reporting.message(f"  after {self.scans_seen} scans, on val: {losses}")
             for warning in self.objective.warnings():
-                self.reporter.message(f"  WARNING: {warning}")
+                reporting.message(f"  WARNING: {warning}")
 
 
 def begin_training(objective: Objective, config: TrainingConfig) -> tuple[Engine, torch.optim.Optimizer]:

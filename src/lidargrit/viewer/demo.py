@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
+from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import CheckpointError
 from lidargrit.core.files import read_json, write_json
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import PRETRAINED, RUN_FILE, locate
 from lidargrit.data.sources import load_range_images
@@ -53,7 +53,7 @@ _STAGES = {"tokenizer": "the tokenizer", "transformer": "the transformer", "pixe
 _SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 
 
-def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter, anew: bool = False) -> Path:
+def demo(data: str | None, folder: Path, settings: list[str], anew: bool = False) -> Path:
     """Run everything on simulated or on the user's scans, and return the folder of the results.
 
     On simulated scans, a transformer is trained anew over the other networks of the model in the package. On the user's
@@ -66,43 +66,43 @@ def demo(data: str | None, folder: Path, settings: list[str], reporter: Reporter
         settings: changed settings of the preset, as ``--set`` takes them.
         anew: whether all networks are trained anew, instead of beginning with those of the model in the package.
     """
-    preset = _preset(data, settings, reporter, anew)
+    preset = _preset(data, settings, anew)
     check_folder(folder, preset)
     expected_s = _expected_s(preset, simulates=data is None)
     minutes = max(1, round(sum(expected_s.values()) / 60))
     about = f"about {minutes} minute{'s' if minutes > 1 else ''} on two cores"
-    reporter.message(f"lidargrit demo: {about}; stop it at any time, the same command goes on")
-    reporter.message(how_trained(preset))
-    reporter.expect(expected_s)
+    reporting.message(f"lidargrit demo: {about}; stop it at any time, the same command goes on")
+    reporting.message(how_trained(preset))
+    reporting.expect(expected_s)
     clock = _Clock(folder / TIMINGS)
     with clock.stage("read the scans and project them" if data else "simulate scans and project them"):
-        real = load_range_images(preset.data.train, preset.data, reporter)
-        val = load_range_images(preset.data.val, preset.data, reporter)
-    generator = train(preset, folder, reporter)
+        real = load_range_images(preset.data.train, preset.data)
+        val = load_range_images(preset.data.val, preset.data)
+    generator = train(preset, folder)
     clock.keep()
     for stage in _trained_stages(preset):
         clock.add(f"train the {stage}", _trained_s(folder / stage / LOG_FILE))
     sampling = _sampling(preset)
     with clock.stage(f"sample {_NUM_SAMPLES} new scans"):
         generator.to(usable_device(""))
-        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling, reporter)
+        write_samples(generator, folder, folder / "samples", range(_NUM_SAMPLES), sampling)
         generator.to("cpu")  # where the images of the pages and pictures are
     samples = read_samples(folder / "samples", _NUM_SAMPLES)
-    packaged = _packaged_samples(folder / "samples_of_packaged_model", clock, reporter) if data is None else None
+    packaged = _packaged_samples(folder / "samples_of_packaged_model", clock) if data is None else None
     with clock.stage("score reconstruction and new scans"):
         reconstruction = score_reconstruction(generator.get_tokenizer(), val)
-        card = _score(samples, real, reporter)
+        card = _score(samples, real)
     write_json(
         folder / "evaluation.json",
         {"reconstruction_on_val": asdict(reconstruction), "generated_against_train": card.to_json()},
     )
-    reporter.message(
+    reporting.message(
         f"reconstruction of {reconstruction.num_scans} scans never trained on: range error "
         f"{reconstruction.range_mae_m:.2f} m, mask accuracy {reconstruction.mask_accuracy:.3f}, dropped rays found "
         f"{reconstruction.drop_recall:.2f} with precision {reconstruction.drop_precision:.2f}"
     )
-    reporter.message(card.as_table())
-    reporter.message(
+    reporting.message(card.as_table())
+    reporting.message(
         "(scores after a few minutes of training on little data; they cannot be compared with published tables)"
     )
     kind = "real" if data else "simulated"
@@ -210,17 +210,17 @@ def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSamp
     return tokenizer.sample(tokens, rngs)
 
 
-def _packaged_samples(folder: Path, clock: "_Clock", reporter: Reporter) -> RangeImages:
+def _packaged_samples(folder: Path, clock: "_Clock") -> RangeImages:
     """Sample from the model in the package, which was trained for hours, for comparison."""
     with clock.stage(f"sample {_PACKAGED_SCANS} scans from the packaged model"):
         model, run = load(PRETRAINED).to(usable_device("")), locate(PRETRAINED)
-        write_samples(model, run, folder, range(_PACKAGED_SCANS), reporter=reporter)
+        write_samples(model, run, folder, range(_PACKAGED_SCANS))
     return read_samples(folder, _PACKAGED_SCANS)
 
 
-def _preset(data: str | None, settings: list[str], reporter: Reporter, anew: bool) -> Preset:
+def _preset(data: str | None, settings: list[str], anew: bool) -> Preset:
     """Return the preset that suits the scans: from the model in the package, if that is wanted and has their rays."""
-    config = None if data is None else divided(data, reporter, _MAX_SCANS)
+    config = None if data is None else divided(data, _MAX_SCANS)
 
     def preset_of(name: str) -> Preset:
         preset = load_preset(name)
@@ -230,7 +230,7 @@ def _preset(data: str | None, settings: list[str], reporter: Reporter, anew: boo
         preset = preset_of("lidargrit_demo_transformer" if config is None else "lidargrit_demo_fine_tuned")
         if preset.data.load_sensor().same_rays(load(PRETRAINED).sensor):
             return preset
-        reporter.message("the model in the package is of another sensor or image size, so all is trained anew")
+        reporting.message("the model in the package is of another sensor or image size, so all is trained anew")
     return preset_of("lidargrit_demo_pixels")
 
 
@@ -261,7 +261,7 @@ def _expected_s(preset: Preset, simulates: bool) -> dict[str, float]:
     }
 
 
-def _score(samples: RangeImages, real: RangeImages, reporter: Reporter) -> Scorecard:
+def _score(samples: RangeImages, real: RangeImages) -> Scorecard:
     """Score new scans against training scans, with both reference rows."""
     count = min(len(samples), len(real))
 
@@ -270,7 +270,7 @@ def _score(samples: RangeImages, real: RangeImages, reporter: Reporter) -> Score
 
     leak = "The reference is of the training scans, so the scores flatter what repeats them"
     pair = EvalPair(some("samples", samples), some("train", real), leak=leak)
-    return compare_pair(pair, EvalConfig(pixel_statistics=True), reporter)
+    return compare_pair(pair, EvalConfig(pixel_statistics=True))
 
 
 _INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
@@ -49,7 +49,6 @@ def load_scan_sets(
     count: int,
     seed: int = 0,
     settings: ScanSettings | None = None,
-    reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
     all_columns: bool = False,
     device: str = "",
@@ -76,7 +75,7 @@ def load_scan_sets(
         DataError: no usable scan in a source.
         ScanError: a scan that cannot be used, unless such scans are skipped.
     """
-    settings, reporter = settings or ScanSettings(), reporter or Reporter()
+    settings = settings or ScanSettings()
     config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
@@ -93,12 +92,12 @@ def load_scan_sets(
     for source in opened:
         if not isinstance(source, RunSource):
             rays = _fine(named or config.imaged(source.sensor)) if fine else sensor
-            how = (count, rays, config, reporter)
+            how = (count, rays, config)
             read = _of_scans(source, *how) if isinstance(source, DatasetSource) else _of_images(source, *how)
             sets.append(replace(read, name=_short(source.text)))
     scans = sets[0] if sets else None
     for name, generator in generators.items():
-        sets += _of_generator(name, generator, seeds, scans, reporter)
+        sets += _of_generator(name, generator, seeds, scans)
     if not sets:
         raise ConfigError("no source", "a scan, a folder or a run", "name at least one")
     return _told_apart(sets)
@@ -113,9 +112,7 @@ def _told_apart(sets: Sequence[ScanSet]) -> list[ScanSet]:
     ]
 
 
-def _of_generator(
-    name: str, generator: Generator, seeds: range, scans: ScanSet | None, reporter: Reporter
-) -> Iterator[ScanSet]:
+def _of_generator(name: str, generator: Generator, seeds: range, scans: ScanSet | None) -> Iterator[ScanSet]:
     """Yield the reconstructions of some scans, if there are any on its rays, and generated scans."""
     if scans is not None and "encode" in generator.capabilities:
         images = scans.images
@@ -123,7 +120,7 @@ def _of_generator(
             reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
             yield ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names)
         else:
-            reporter.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
+            reporting.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
     generated = _joined(generator.sample(seeds[part]) for part in _parts(len(seeds)))
     yield ScanSet(f"{_short(name)}: generated", generated, tuple(f"seed {one}" for one in seeds))
 
@@ -142,20 +139,16 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
     return RangeImage.stack([batch[index].to("cpu") for batch in batches for index in range(len(batch))])
 
 
-def _of_images(
-    source: Source, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
-) -> ScanSet:
-    images = source.images(sensor, source.as_projected(config), reporter)
+def _of_images(source: Source, count: int, sensor: SensorModel | None, config: DataConfig) -> ScanSet:
+    images = source.images(sensor, source.as_projected(config))
     indices = evenly_spaced(count, len(images))
     names = images.provenance.names
     return ScanSet(source.text, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
 
 
-def _of_scans(
-    source: DatasetSource, count: int, sensor: SensorModel | None, config: DataConfig, reporter: Reporter
-) -> ScanSet:
+def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, config: DataConfig) -> ScanSet:
     dataset, imaging = source.scans(), source.imaging(sensor, config)
-    imaging.report(reporter)
+    imaging.report()
     sensor, config = imaging.sensor, imaging.config
     images, names, filled = [], [], []
     for index in evenly_spaced(count, len(dataset)):
@@ -166,7 +159,7 @@ def _of_scans(
         except ScanError as error:
             if config.bad_scans == "refuse":
                 raise
-            reporter.message(f"left out: {error}")
+            reporting.message(f"left out: {error}")
             continue
         names.append(dataset.name(index))
     if not images:

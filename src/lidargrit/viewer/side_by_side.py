@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
@@ -25,7 +24,6 @@ def view(
     count: int = 3,
     seed: int = 0,
     settings: ScanSettings | None = None,
-    reporter: Reporter | None = None,
     surprise_by: str = "",
     device: str = "",
 ) -> None:
@@ -52,7 +50,7 @@ def view(
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", f"correct the number{other}")
     model = load(surprise_by).to(usable_device(device)) if surprise_by else None
     rays = None if model is None else model.sensor
-    sets = load_scan_sets(sources, count, seed, settings, reporter, rays, is_page, device)
+    sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:
         sets = [replace(scans, surprise=_surprise(model, scans.images)) for scans in sets]
     groups = {scans.name: scans.images for scans in sets}

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, replace
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.scans.projection import doubts_about_rays, projection_that_fits
@@ -35,10 +35,10 @@ class Imaging:
     notes: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
 
-    def report(self, reporter: Reporter) -> None:
+    def report(self) -> None:
         """Report what was chosen, and warn of what is in doubt."""
         for line in (*self.notes, *(f"WARNING: {doubt}" for doubt in self.doubts)):
-            reporter.message(line)
+            reporting.message(line)
 
 
 def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> Imaging:

@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
 from lidargrit.core.errors import DataError, OutputError, counted_scans
 from lidargrit.core.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.config import DataConfig
@@ -41,7 +41,6 @@ def prepare(
     source: str,
     config: DataConfig,
     folder: Path | None = None,
-    reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
     rank: int | None = None,
     world_size: int | None = None,
@@ -65,7 +64,7 @@ def prepare(
         OutputError: the folder holds something else, or images of scans or settings that have changed since.
         ScanError: a scan that cannot be used; names it.
     """
-    reporter, sensor = reporter or Reporter(), sensor or config.load_sensor()
+    sensor = sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
     dataset = open_dataset(source, config.bad_points) if dataset is None else dataset
     spec, scans = _spec(source, dataset, sensor, config)
@@ -79,8 +78,8 @@ def prepare(
                 if not (folder / PLAN_FILE).exists():  # another machine has failed meanwhile, and taken its plan back
                     _claim(folder, spec, scans)
                 mine = [shard for shard in missing if shard % world_size == rank]
-                make_shards(folder, spec, mine, dataset, config.workers, reporter)
-                _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank], reporter)
+                make_shards(folder, spec, mine, dataset, config.workers)
+                _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank])
         except BaseException:
             _take_back(folder)
             raise
@@ -130,7 +129,6 @@ def prepare_and_describe(
     dataset: ScanDataset,
     config: DataConfig,
     folder: Path | None,
-    reporter: Reporter,
     rank: int | None = None,
     world_size: int | None = None,
     verify: bool = False,
@@ -138,7 +136,7 @@ def prepare_and_describe(
     """Prepare a source and return what the folder holds.
 
     Args:
-        source, dataset, config, folder, reporter, rank, world_size: the arguments of :func:`prepare`.
+        source, dataset, config, folder, rank, world_size: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
 
     Raises:
@@ -146,17 +144,17 @@ def prepare_and_describe(
     """
     begun = time.monotonic()
     imaging = choose_imaging(source, dataset, config.load_sensor(), config)
-    imaging.report(reporter)
+    imaging.report()
     config, sensor = imaging.config, imaging.sensor
-    folder = prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
-    if verify and (damaged := damaged_shards(folder, reporter, rank, world_size)):
-        reporter.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
+    folder = prepare(source, config, folder, sensor, rank, world_size, dataset)
+    if verify and (damaged := damaged_shards(folder, rank, world_size)):
+        reporting.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
         for shard in damaged:
             (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
-        prepare(source, config, folder, reporter, sensor, rank, world_size, dataset)
+        prepare(source, config, folder, sensor, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for remark in images.remarks():
-        reporter.message(remark)
+        reporting.message(remark)
     if not len(images):
         raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
@@ -164,9 +162,7 @@ def prepare_and_describe(
     return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
 
 
-def damaged_shards(
-    folder: Path, reporter: Reporter | None = None, rank: int | None = None, world_size: int | None = None
-) -> list[int]:
+def damaged_shards(folder: Path, rank: int | None = None, world_size: int | None = None) -> list[int]:
     """Read every image of this machine's shards of a prepared folder, and return the numbers of damaged shards.
 
     A machine does not look at the shards of others: these may be making a damaged one again at this moment.
@@ -175,7 +171,7 @@ def damaged_shards(
     images = PreparedImages(str(folder))
     mine = [index for index in range(len(images)) if images.shard_of(index) % world_size == rank]
     damaged: set[int] = set()
-    with (reporter or Reporter()).progress("verifying", len(mine)) as progress:
+    with reporting.progress("verifying", len(mine)) as progress:
         for index in mine:
             try:
                 images.read(index, verify=True)
@@ -292,10 +288,10 @@ def _is_whole(folder: Path, spec: PreparedSpec, shard: int) -> bool:
     return spec.is_shard(shard, entries, left_out)
 
 
-def _wait_for(folder: Path, spec: PreparedSpec, shards: list[int], reporter: Reporter) -> None:
+def _wait_for(folder: Path, spec: PreparedSpec, shards: list[int]) -> None:
     """Wait until other machines have made their shards."""
     last = time.monotonic()
-    with reporter.progress("waiting for others", len(shards)) as progress:
+    with reporting.progress("waiting for others", len(shards)) as progress:
         while shards:
             still = [shard for shard in shards if not _is_whole(folder, spec, shard)]
             if len(still) < len(shards):

@@ -14,11 +14,10 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from lidargrit.core import errors
+from lidargrit.core import errors, reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import DataError, LidarGritError, ScanError
 from lidargrit.core.processes import module_command
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedSpec, shard_name, unfinished_name
 from lidargrit.data.prepared.shards import LocalBytes, ShardWriter
@@ -28,9 +27,7 @@ from lidargrit.scans.sensors import SensorModel
 _KEEP_EVERY_S = 5.0  # what a killed process loses at most; a shard of real scans takes about as long
 
 
-def make_shards(
-    folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int, reporter: Reporter
-) -> None:
+def make_shards(folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int) -> None:
     """Make shards, in this process if one is enough, else in several.
 
     Raises:
@@ -38,7 +35,7 @@ def make_shards(
     """
     total = sum(len(spec.scans_of(shard)) for shard in shards)
     workers = min(workers, len(shards))
-    with reporter.progress("projecting scans", spec.num_scans, spec.num_scans - total) as progress:
+    with reporting.progress("projecting scans", spec.num_scans, spec.num_scans - total) as progress:
         if workers <= 1:
             for shard in shards:
                 make_shard(folder, spec, shard, dataset, progress.advance)

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import DataError, LidarGritError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
@@ -57,18 +57,16 @@ class DatasetSource(Source):
         """Return the data set, as it was opened."""
         return self._dataset
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans once, and find them in the cache from then on."""
-        config, reporter = config or DataConfig(), reporter or Reporter()
+        config = config or DataConfig()
         imaging = self.imaging(sensor, config)
-        imaging.report(reporter)
+        imaging.report()
         sensor, config = imaging.sensor, imaging.config
-        folder = prepare(self.text, config, reporter=reporter, sensor=sensor, dataset=self._dataset)
+        folder = prepare(self.text, config, sensor=sensor, dataset=self._dataset)
         prepared = PreparedImages(str(folder))
         self.doubts, self._imaged_by = (*imaging.doubts, *prepared.doubts()), config.projection_variant
-        _require_some(self.text, prepared, reporter)
+        _require_some(self.text, prepared)
         return RangeImages(sensor, [prepared])
 
     def imaging(self, sensor: SensorModel | None, config: DataConfig) -> Imaging:
@@ -100,17 +98,15 @@ class PreparedSource(Source):
         """Return the variant that the scans were prepared by."""
         return self._prepared.spec.variant
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the images, with all columns that were prepared, or with fewer if the sensor has fewer."""
-        config, sensor, reporter = config or DataConfig(), sensor or self.sensor, reporter or Reporter()
+        config, sensor = config or DataConfig(), sensor or self.sensor
         chosen = self._prepared.evenly_spaced(config.max_scans) if config.max_scans else self._prepared
         store = chosen.on_rays_of(sensor, config.projection_variant)
         if store is not chosen:
             columns = f"{self.sensor.width} columns gathered into {sensor.width * sensor.column_stride}"
-            reporter.message(f"{self.text}: {columns}, of each pixel the nearest return")
-        _require_some(self.text, chosen, reporter)
+            reporting.message(f"{self.text}: {columns}, of each pixel the nearest return")
+        _require_some(self.text, chosen)
         self.doubts = chosen.doubts()
         return RangeImages(sensor, [store])
 
@@ -133,9 +129,7 @@ class SampleSource(Source):
         """Return the variant by which the training scans of the model became images."""
         return projection_of(self.folder)
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the samples, or so many of them, evenly spaced."""
         return read_samples(self.folder, (config or DataConfig()).max_scans or None)
 
@@ -173,9 +167,7 @@ class TensorSource(Source):
         """Return the variant that the program projects its training scans by."""
         return self._format.variant
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the samples, or so many of them, evenly spaced."""
         return read_tensor_folder(self._folder, self.split, (config or DataConfig()).max_scans or None)
 
@@ -198,9 +190,7 @@ class RunSource(Source):
         """Return the variant by which the training scans became images."""
         return recorded_projection(self.folder)
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Refuse: scans have to be generated first.
 
         Raises:
@@ -262,9 +252,7 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     return ImageFileSource(text, images) if images else DatasetSource(text, bad_points)
 
 
-def load_range_images(
-    sources: Sequence[str], config: DataConfig, reporter: Reporter | None = None, sensor: SensorModel | None = None
-) -> RangeImages:
+def load_range_images(sources: Sequence[str], config: DataConfig, sensor: SensorModel | None = None) -> RangeImages:
     """Open the range images of several sources as one set, to train from or to watch.
 
     Scans are projected once and then found in the cache: ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache
@@ -273,25 +261,23 @@ def load_range_images(
     Args:
         sources: names of data sets, folders of scans, and prepared folders, as in :class:`DataConfig`.
         config: settings of projecting scans; its own sources are ignored.
-        reporter: receiver of progress.
         sensor: sensor to project with, in place of the configuration's.
 
     Raises:
         DataError: no source, a source without a scan, generated scans, or prepared scans of another sensor.
         ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
     """
-    return joined_images(open_to_train(sources, config), config, reporter, sensor)
+    return joined_images(open_to_train(sources, config), config, sensor)
 
 
 def joined_images(
     opened: Sequence[DatasetSource | PreparedSource],
     config: DataConfig,
-    reporter: Reporter | None = None,
     sensor: SensorModel | None = None,
 ) -> RangeImages:
     """Return the range images of sources that :func:`open_to_train` has opened as one set."""
     sensor = sensor or config.load_sensor()
-    return RangeImages.joined(sensor, [source.images(sensor, config, reporter) for source in opened])
+    return RangeImages.joined(sensor, [source.images(sensor, config) for source in opened])
 
 
 def open_to_train(sources: Sequence[str], config: DataConfig) -> list[DatasetSource | PreparedSource]:
@@ -308,11 +294,9 @@ def open_to_train(sources: Sequence[str], config: DataConfig) -> list[DatasetSou
     return opened
 
 
-def open_images(
-    text: str, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-) -> RangeImages:
+def open_images(text: str, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
     """Open the range images of one source; see :func:`open_source` and :meth:`Source.images`."""
-    return open_source(text, config.bad_points if config else "refuse").images(sensor, config, reporter)
+    return open_source(text, config.bad_points if config else "refuse").images(sensor, config)
 
 
 def overlap(source: Source, images: RangeImages | None, reference: RangeImages) -> str:
@@ -348,9 +332,9 @@ def _data_set_or_nothing(text: str) -> tuple[str, str]:
         return "", ""
 
 
-def _require_some(text: str, prepared: PreparedImages, reporter: Reporter) -> None:
+def _require_some(text: str, prepared: PreparedImages) -> None:
     """Tell which scans were left out and what some lack, and raise DataError if none is left."""
     for remark in prepared.remarks():
-        reporter.message(remark)
+        reporting.message(remark)
     if not len(prepared):
         raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")

@@ -9,7 +9,6 @@ from lidargrit.core import discovery
 from lidargrit.core.arrays import ARRAY_BYTES_AT_MOST, parse_array
 from lidargrit.core.determinism import evenly_spaced, natural_order
 from lidargrit.core.errors import ConfigError, DataError, LidarGritError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.datasets.folder import Folder
@@ -62,9 +61,7 @@ class ImageFileSource(Source):
         """Return "": nothing tells how the images were made."""
         return ""
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the images, which have the rows and columns of the sensor."""
         sensor, count = sensor or self.sensor, len(self._paths)
         chosen = evenly_spaced((config or DataConfig()).max_scans or count, count)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import DataError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.source import Source
@@ -41,9 +40,7 @@ class MemorySource(Source):
         """Return the variant that the configuration names."""
         return config.projection_variant
 
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans, or so many of them, evenly spaced."""
         sensor, config = sensor or self.sensor, config or DataConfig()
         chosen = evenly_spaced(config.max_scans or len(self._scans), len(self._scans))

@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import ClassVar
 
 from lidargrit.core.errors import DataError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -45,15 +44,12 @@ class Source(ABC):
         return replace(config, projection_variant=self.projection_variant(config) or config.projection_variant)
 
     @abstractmethod
-    def images(
-        self, sensor: SensorModel | None = None, config: DataConfig | None = None, reporter: Reporter | None = None
-    ) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Return the range images of the source; pixels are read when they are asked for.
 
         Args:
             sensor: sensor that scans are projected with; the source's own if not given. Samples keep theirs.
             config: settings of reading and projecting scans; its sources and sensor are ignored.
-            reporter: receiver of progress, and of messages about scans that are left out.
 
         Raises:
             DataError: no usable scan, or prepared scans of another sensor or projection.

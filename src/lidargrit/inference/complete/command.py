@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.files import OutputConfig, Written, write_completions
@@ -17,7 +16,6 @@ def complete_scans(
     task: Task,
     output: OutputConfig,
     config: DataConfig | None = None,
-    reporter: Reporter | None = None,
 ) -> Written:
     """Write the scans of a source as a task changes them: whole clouds, or the images of the model.
 
@@ -37,7 +35,7 @@ def complete_scans(
         UsageError: all pixels are observed, or a mask of another size.
         ScanError: a scan that cannot be used, of another sensor, or without a return among the observed pixels.
     """
-    config, reporter = config or DataConfig(), reporter or Reporter()
-    inputs = open_inputs(source, task.reader(model.sensor, model.projection_variant), config, reporter)
+    config = config or DataConfig()
+    inputs = open_inputs(source, task.reader(model.sensor, model.projection_variant), config)
     facts = {"verb": task.verb, "source": source, **task.identity()}
-    return write_completions(inputs, out, model, task, output, facts, config, reporter)
+    return write_completions(inputs, out, model, task, output, facts, config)

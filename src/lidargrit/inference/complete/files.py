@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
 from lidargrit.core.files import claim_folder, write_json
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.datasets.folder import SENSOR_FILE
 from lidargrit.data.export import IMAGE, TREE, KittiTree, check_names, claimed_scans, tell_labels_lost, write_array
 from lidargrit.data.formats import ScanFormat
@@ -94,7 +94,6 @@ def write_completions(
     output: OutputConfig,
     facts: dict[str, Any],
     config: DataConfig,
-    reporter: Reporter,
 ) -> Written:
     """Complete every scan and write it; files that are there already are not written again.
 
@@ -117,14 +116,14 @@ def write_completions(
     files, facts = _files(inputs, str(facts["source"]), output), facts | _facts(model, output)
     identities, left_out = {file: inputs.identity(index) for (index, _), file in files.items()}, set[int]()
     missing = [job for job, file in files.items() if not (out / file).exists()]
-    jobs = _jobs(inputs, missing, model, task, output, left_out if config.bad_scans == "skip" else None, reporter)
+    jobs = _jobs(inputs, missing, model, task, output, left_out if config.bad_scans == "skip" else None)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, np.zeros(3, dtype=np.int64)
     told_labels = False
     with (
         claim_folder(out),
         claimed_scans(out / "completed.json", {**facts, "scans": identities}) as files_left_out,
-        reporter.progress("completing", len(files), len(files) - len(missing)) as progress,
+        reporting.progress("completing", len(files), len(files) - len(missing)) as progress,
     ):
         for batch in _batches(chain(first, jobs), model.generator.compute_batch):
             for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
@@ -137,7 +136,7 @@ def write_completions(
                 else:
                     kept_labels, points = _write_cloud(out / file, sensor_file, output.format, task, job, images)
                     counts += points
-                told_labels = told_labels or tell_labels_lost(not kept_labels, file, reporter)
+                told_labels = told_labels or tell_labels_lost(not kept_labels, file)
                 progress.advance(1)
         files_left_out.update(file for (index, _), file in files.items() if index in left_out)
     if len(left_out) == len(inputs):
@@ -203,7 +202,6 @@ def _jobs(
     task: Task,
     output: OutputConfig,
     skipped: set[int] | None,
-    reporter: Reporter,
 ) -> Iterator[_Job]:
     """Read each scan of missing files once; note those that cannot be used in a set, or refuse them without one."""
     last, job = -1, None
@@ -218,7 +216,7 @@ def _jobs(
             except ScanError as error:
                 if skipped is None:
                     raise
-                reporter.message(f"left out: {error}")
+                reporting.message(f"left out: {error}")
                 skipped.add(index)
         if job is not None:
             yield replace(job, turn=turn)

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Int64
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, ScanError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data import formats
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.images import RangeImages
@@ -90,11 +90,10 @@ class Inputs:
 
     Args:
         reader: projection of points to range images.
-        reporter: receiver of how many points of the first scan have a pixel, and of the first doubt about the sensor.
     """
 
-    def __init__(self, scans: PointScans | ImageScans, reader: "ScanReader", reporter: Reporter) -> None:
-        self._scans, self._reader, self._reporter = scans, reader, reporter
+    def __init__(self, scans: PointScans | ImageScans, reader: "ScanReader") -> None:
+        self._scans, self._reader = scans, reader
         self._counted = self._doubted = False
 
     def __len__(self) -> int:
@@ -143,9 +142,9 @@ class Inputs:
         scan = self._reader.read(points) if see is None else see(points)
         if not self._counted and see is None:
             self._counted = True
-            self._reporter.message(told_share(scan.image, len(points)))
+            reporting.message(told_share(scan.image, len(points)))
         if scan.doubt and not self._doubted:
-            self._reporter.message(f"WARNING: {scan.doubt}")
+            reporting.message(f"WARNING: {scan.doubt}")
             self._doubted = True
         return scan
 
@@ -199,7 +198,7 @@ class ScanReader:
         return InputScan(image, scan, at, doubt=said, pixels=pixels, by_ring=method == "unfolding")
 
 
-def images_for(models: Sequence[Model], source: str, settings: ScanSettings, reporter: Reporter) -> RangeImages:
+def images_for(models: Sequence[Model], source: str, settings: ScanSettings) -> RangeImages:
     """Return whole scans as range images that all models are compared on.
 
     They are projected as the first model's training scans were, unless a variant is named, with a warning if another
@@ -208,24 +207,22 @@ def images_for(models: Sequence[Model], source: str, settings: ScanSettings, rep
     Args:
         models: models and classical methods.
         settings: settings of reading and projecting them.
-        reporter: receiver of progress and of the warning.
     """
     learned = [one.projection_variant for one in models if one.folder is not None]
     variant = settings.projection_variant or next(iter(learned), "exact")
     if {*learned} - {variant}:
-        reporter.message(f"WARNING: scans are projected by {variant!r}, and some models learned from other images")
+        reporting.message(f"WARNING: scans are projected by {variant!r}, and some models learned from other images")
     data = replace(settings.data, projection_variant=variant)
-    return open_images(source, data.imaged(models[0].sensor), data, reporter)
+    return open_images(source, data.imaged(models[0].sensor), data)
 
 
-def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: Reporter) -> Inputs:
+def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
     """Open the scans that a user named.
 
     Args:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
-        reporter: receiver of a warning about scans that another sensor seems to have made.
 
     Raises:
         ConfigError: range images of other rays than the reader's sensor.
@@ -238,7 +235,7 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig, reporter: R
             f"images of the model's {wanted.height}x{wanted.width} of {wanted.name!r}, with the same rays",
             "name a model for such images with --model, or give the scans as points",
         )
-    return Inputs(scans, reader, reporter)
+    return Inputs(scans, reader)
 
 
 def sensor_of(source: str, name: str = "") -> SensorModel:

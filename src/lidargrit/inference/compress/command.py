@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import CheckpointError, DataError, ScanError, UsageError
 from lidargrit.core.files import claim_folder
-from lidargrit.core.reporting import Reporter
 from lidargrit.core.version import __version__
 from lidargrit.data.export import IMAGE, check_names, claimed_scans, writable_format, write_array
 from lidargrit.data.prepared.config import DataConfig
@@ -43,9 +43,7 @@ class Compressed:
         return 8 * self.num_bytes / max(self.num_returns, 1)
 
 
-def compress_scans(
-    source: str, out: Path, model: str, step_mm: int, config: DataConfig, reporter: Reporter
-) -> Compressed:
+def compress_scans(source: str, out: Path, model: str, step_mm: int, config: DataConfig) -> Compressed:
     """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
 
     Args:
@@ -62,14 +60,14 @@ def compress_scans(
     """
     codec = ScanCodec(load(model), step_mm)
     reader = ScanReader(codec.sensor, projection_variant(locate(model)))
-    inputs = open_inputs(source, reader, config, reporter)
+    inputs = open_inputs(source, reader, config)
     check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     told = False
     with writing(out, _header(codec, model), chosen) as writer:
         done = writer.go_on(inputs.identity(index) for index in range(len(inputs)))
-        with reporter.progress("compressing", len(inputs), done) as progress:
+        with reporting.progress("compressing", len(inputs), done) as progress:
             for index in range(done, len(inputs)):
                 scan = inputs.name(index), inputs.identity(index)
                 try:
@@ -78,20 +76,20 @@ def compress_scans(
                 except ScanError as error:
                     if config.bad_scans == "refuse":
                         raise
-                    reporter.message(f"left out: {error}")
+                    reporting.message(f"left out: {error}")
                     writer.add(*scan, b"", 0)
                 else:
                     writer.add(*scan, data, returns)
                     if not told and (lost := _not_kept(image)):
                         told = True
-                        reporter.message(f"{out.suffix} keeps no {lost}")
+                        reporting.message(f"{out.suffix} keeps no {lost}")
                 progress.advance(1)
         if not writer.num_scans:
             raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
     return Compressed(writer.num_scans, writer.num_returns, out.stat().st_size)
 
 
-def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int], reporter: Reporter) -> int:
+def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int]) -> int:
     """Write the scans of a compressed file as they were, and return their number.
 
     The whole file is checked before anything is written, and each scan's pixels before its own file.
@@ -125,7 +123,7 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     with (
         claim_folder(out),
         claimed_scans(out / "decompressed.json", {**facts, "scans": scans}),
-        reporter.progress("decompressing", len(files), len(files) - len(missing)) as progress,
+        reporting.progress("decompressing", len(files), len(files) - len(missing)) as progress,
     ):
         for index in missing:
             image = codec.decompress(archive.read(index))

@@ -7,9 +7,9 @@ from pathlib import Path
 from jaxtyping import Int
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, ScanError
 from lidargrit.core.files import claim_folder
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.export import KittiTree, claimed_scans, write_with_labels
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, weights_sha256
@@ -34,7 +34,6 @@ def segment_scans(
     out: Path,
     model: str = "pretrained",
     config: DataConfig | None = None,
-    reporter: Reporter | None = None,
     device: str = "",
     numbering: str = "",
 ) -> tuple[int, LabelScores | None]:
@@ -48,7 +47,6 @@ def segment_scans(
         out: an empty folder, or one that the same command began.
         model: segmenter; see :func:`.open_segmenter`.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        reporter: receiver of progress and messages.
         device: device to compute on.
         numbering: numbering of the scans' own labels, with which the found ones are compared; "" for no comparison.
 
@@ -61,11 +59,11 @@ def segment_scans(
         DataError: no usable scan, or own labels are missing where they are to be compared.
         OutputError: the folder holds something else, lies in the source, or cannot be written.
     """
-    config, reporter = config or DataConfig(), reporter or Reporter()
+    config = config or DataConfig()
     segmenter = open_segmenter(model, device)
     source_scans = _opened(source, segmenter, config)
     source_scans.check_output(out)
-    scans = _LabelledScans(source_scans, segmenter, reporter)
+    scans = _LabelledScans(source_scans, segmenter)
     files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
     identities = {file: source_scans.identity(index) for index, file in enumerate(files)}
     facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment")), "scans": identities}
@@ -77,7 +75,7 @@ def segment_scans(
     with (
         claim_folder(out),
         claimed_scans(out / MANIFEST, facts) as files_left_out,
-        reporter.progress("labelling", len(files), len(files) - len(wanted)) as progress,
+        reporting.progress("labelling", len(files), len(files) - len(wanted)) as progress,
     ):
         for index, scan, label in scans.labelled(wanted, left_out if config.bad_scans == "skip" else None):
             progress.advance(1)
@@ -110,11 +108,10 @@ class _LabelledScans:
     Args:
         scans: scans of the source.
         segmenter: segmenter of a run.
-        reporter: receiver of the first doubt about the sensor, and of the first number of points without a label.
     """
 
-    def __init__(self, scans: NamedScans, segmenter: Segmenter, reporter: Reporter) -> None:
-        self._scans, self._segmenter, self._reporter = scans, segmenter, reporter
+    def __init__(self, scans: NamedScans, segmenter: Segmenter) -> None:
+        self._scans, self._segmenter = scans, segmenter
         self._reader, self._told = (
             ScanReader(segmenter.sensor.fine(), partial=True, few_rings_cure=_FEW_RINGS_CURE),
             set[str](),
@@ -140,7 +137,7 @@ class _LabelledScans:
             except ScanError as error:
                 if skipped is None:
                     raise
-                self._reporter.message(f"left out: {error}")
+                reporting.message(f"left out: {error}")
                 skipped.add(index)
             else:
                 yield index, scan, label
@@ -164,7 +161,7 @@ class _LabelledScans:
     def _tell(self, kind: str, what: str) -> None:
         if kind not in self._told:
             self._told.add(kind)
-            self._reporter.message(what)
+            reporting.message(what)
 
 
 def _own_labels(scan: Scan, numbering: str) -> Int[Tensor, " n"]:

@@ -8,7 +8,6 @@ from typing import Any, final
 import numpy as np
 
 from lidargrit.core.errors import ConfigError, DataError, WeightsError
-from lidargrit.core.reporting import Reporter
 from lidargrit.data.run_folder import PACKAGED, locate, read_config, weights_sha256
 from lidargrit.evaluation.metrics import FeatureExtractor, Metric
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
@@ -51,7 +50,6 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
         seed: seed of nothing: the metric has no random numbers.
         weights: folder of a segmenter's run; if not given, the segmenter in the package that has the images' rows.
         device: device on which the segmenter computes, such as "cuda".
-        reporter: receiver of nothing: nothing is fetched.
 
     Raises:
         WeightsError: no segmenter for the rows of the images.
@@ -73,7 +71,6 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
         seed: int = 0,
         weights: Path | None = None,
         device: str = "cpu",
-        reporter: Reporter | None = None,
     ) -> None:
         super().__init__(variant=variant, seed=seed)
         self.weights, self.device = weights, str(usable_device(device))

@@ -10,7 +10,6 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, DataError
-from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.metrics import FeatureExtractor, Metric
 from lidargrit.evaluation.metrics.shared.accumulators import Kept
 from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork, load_network
@@ -143,10 +142,9 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
         seed: int = 0,
         weights: Path | None = None,
         device: str = "cpu",
-        reporter: Reporter | None = None,
     ) -> None:
         super().__init__(variant=variant, seed=seed)
-        self.network = load_network(self.needs_weights, weights, device, reporter)
+        self.network = load_network(self.needs_weights, weights, device)
 
     @property
     def weights_sha256(self) -> str:

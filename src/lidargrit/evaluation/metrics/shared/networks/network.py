@@ -11,7 +11,6 @@ from jaxtyping import Float, Float32
 from torch import Tensor, nn
 
 from lidargrit.core.errors import WeightsError
-from lidargrit.core.reporting import Reporter
 from lidargrit.evaluation.metrics.shared.networks.pointnet import POINTNET_WEIGHTS, PointNet
 from lidargrit.evaluation.metrics.shared.networks.rangenet import RANGENET_WEIGHTS, RangeNet53
 from lidargrit.evaluation.metrics.shared.networks.weights import PublishedWeights, find_weights, read_weights
@@ -73,9 +72,7 @@ class PretrainedNetwork:
         return features
 
 
-def load_network(
-    name: str, weights: Path | None = None, device: str = "cpu", reporter: Reporter | None = None
-) -> PretrainedNetwork:
+def load_network(name: str, weights: Path | None = None, device: str = "cpu") -> PretrainedNetwork:
     """Return a network with its published weights; the same object while its file stays the same.
 
     Args:
@@ -84,7 +81,7 @@ def load_network(
     Raises:
         WeightsError: the file is not to be had, or not of this network.
     """
-    path = find_weights(NETWORKS[name][0], weights, reporter)
+    path = find_weights(NETWORKS[name][0], weights)
     status = path.stat() if path.is_file() else None
     return _loaded(name, path, device, status and (status.st_size, status.st_mtime_ns))
 

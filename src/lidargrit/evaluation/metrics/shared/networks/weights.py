@@ -17,10 +17,10 @@ from pathlib import Path
 
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.environment import cache_folder, folder_in
 from lidargrit.core.errors import WeightsError
 from lidargrit.core.files import atomic_path
-from lidargrit.core.reporting import Reporter
 from lidargrit.nn.published import RefusedFileError, float_tensors, unpickle
 
 FOLDER_VARIABLE = "LIDARGRIT_WEIGHTS"
@@ -60,7 +60,7 @@ class PublishedWeights:
         return self.url.rpartition("/")[2]
 
 
-def find_weights(published: PublishedWeights, given: Path | None = None, reporter: Reporter | None = None) -> Path:
+def find_weights(published: PublishedWeights, given: Path | None = None) -> Path:
     """Return the file with the weights: the given one, else one that is there already, else download it to the cache.
 
     It is looked for in ``$LIDARGRIT_WEIGHTS`` and in ``weights`` in the cache, by the name that it has at its source.
@@ -75,7 +75,7 @@ def find_weights(published: PublishedWeights, given: Path | None = None, reporte
         if (folder / published.file_name).exists():
             return folder / published.file_name
     target = folders[-1] / published.file_name
-    _fetch(published, target, reporter or Reporter())
+    _fetch(published, target)
     return target
 
 
@@ -150,14 +150,14 @@ class _Bounded(io.RawIOBase):
         return data
 
 
-def _fetch(published: PublishedWeights, target: Path, reporter: Reporter) -> None:
+def _fetch(published: PublishedWeights, target: Path) -> None:
     failed_s, why = _failures.pop(published.url, (-math.inf, ""))
     if time.monotonic() - failed_s < _AGAIN_S:
         _failures[published.url] = failed_s, why
         raise _missing(published, target, why)
-    reporter.message(f"fetching {published.url} ({published.licence})")
+    reporting.message(f"fetching {published.url} ({published.licence})")
     with atomic_path(target) as temporary:
-        with temporary.open("wb") as file, closing(_received(published, target, reporter)) as chunks:
+        with temporary.open("wb") as file, closing(_received(published, target)) as chunks:
             for chunk in chunks:
                 file.write(chunk)
         try:
@@ -165,17 +165,17 @@ def _fetch(published: PublishedWeights, target: Path, reporter: Reporter) -> Non
         except WeightsError:
             raise _missing(published, target, "what came is not what was asked for") from None
     if published.sha256 is None:
-        reporter.message(f"{target}: SHA-256 {checksum}; none is known to compare it with")
+        reporting.message(f"{target}: SHA-256 {checksum}; none is known to compare it with")
 
 
-def _received(published: PublishedWeights, target: Path, reporter: Reporter) -> Generator[bytes, None, None]:
+def _received(published: PublishedWeights, target: Path) -> Generator[bytes, None, None]:
     request = urllib.request.Request(published.url, headers={"User-Agent": "lidargrit"})
     received = 0
     try:
         with urllib.request.build_opener(_HttpsOnly).open(request, timeout=_TIMEOUT_S) as response:
             promised = response.headers.get("Content-Length", "")
             expected = int(promised) if promised.isdecimal() else published.bytes_at_most
-            with reporter.progress(f"{published.file_name}, MB", expected // 10**6) as progress:
+            with reporting.progress(f"{published.file_name}, MB", expected // 10**6) as progress:
                 while chunk := response.read(_CHUNK):
                     before, received = received, received + len(chunk)
                     if received > published.bytes_at_most:
