@@ -208,10 +208,7 @@ def test_settings_of_a_preset_are_checked_with_the_words_of_their_class():
         ConfigError, match=r"^got model.tokenizer.channels=40; wanted a whole number, at least 32, a multiple of 32"
     ):
         load_preset("lidargrit_small", ["model.tokenizer.channels=40"])
-    with pytest.raises(
-        ConfigError,
-        match=r"^got training.tokenizer.batch_size=0; wanted a whole number, at least 1, at most [\d,]+; correct the value$",
-    ):
+    with pytest.raises(ConfigError, match=r"^got training.tokenizer.batch_size=0; wanted a whole number, at least 1, "):
         load_preset("lidargrit_small", ["training.tokenizer.batch_size=0"])
     with pytest.raises(ConfigError, match=r"^got training.tokenizer.learning_rate=nan; wanted a number, above 0"):
         load_preset("lidargrit_small", ["training.tokenizer.learning_rate=nan"])

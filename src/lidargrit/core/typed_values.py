@@ -98,9 +98,10 @@ def fits(hint: Any, value: Any) -> bool:
 def _is_a(kind: type, value: Any) -> bool:
     if kind not in (int, float):
         return isinstance(value, kind)
-    is_number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-    largest = WHOLE_NUMBER_AT_MOST if kind is int else sys.float_info.max  # infinity and NaN lie outside
-    return is_number and -largest <= value <= largest
+    if isinstance(value, bool) or not isinstance(value, Integral if kind is int else Real):
+        return False
+    number: Any = value  # the abstract kinds of numbers do not tell that they are ordered
+    return abs(number) <= (WHOLE_NUMBER_AT_MOST if kind is int else sys.float_info.max)  # infinity and NaN are not
 
 
 def check(hint: Any, value: Any, name: str) -> None:
