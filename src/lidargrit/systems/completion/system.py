@@ -37,6 +37,7 @@ class Completion(Generator[CompletionConfig, NoSampling]):
     """
 
     Config = CompletionConfig
+    trains = (("completion", "completion"),)
     facts = SystemFacts(
         generates="range as a best guess and raydrop around observed pixels; no scans worth sampling",
         first_command="complete SCANS completed --observed rows:4 --model RUN",
@@ -53,18 +54,9 @@ class Completion(Generator[CompletionConfig, NoSampling]):
         sizes = CompletionNetworkConfig((8, 8, 8), blocks=1, attention_layers=1, heads=2, features=4, mask_width=4)
         return CompletionConfig(sizes)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The network alone."""
-        return ("completion",)
-
     def objective(self, stage: str) -> Objective:
         """Return the errors of hidden pixels."""
         return CompletionObjective(self.completion, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.completion.load_state_dict(objective.get_submodule(stage).state_dict())
 
     @property
     def takes(self) -> frozenset[type[Condition]]:

@@ -105,6 +105,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     """
 
     Config = DustyConfig
+    trains = (("adversarial", "synthesis"),)
     facts = SystemFacts(
         generates="range and raydrop, sampled over a scan without holes",
         paper="Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021",
@@ -137,19 +138,9 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         """Return a search of 200 steps, by which a small model came as near to the truth as by the program's 1,000."""
         return DustySampling(search_steps=200)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage, of two players."""
-        return ("adversarial",)
-
     def objective(self, stage: str) -> Objective:
         """Return the losses of the network and of a discriminator."""
         return AdversarialObjective(self.synthesis, self.config, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network; its discriminator has done its work."""
-        assert isinstance(objective, AdversarialObjective)
-        self.synthesis.load_state_dict(objective.synthesis.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: DustySampling) -> RangeImage:
         return self._generate(self._latents(seeds), seeds, sampling)

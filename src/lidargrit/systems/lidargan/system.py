@@ -74,6 +74,7 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
     """
 
     Config = LidarGanConfig
+    trains = (("adversarial", "image", "decoder"),)
     facts = SystemFacts(
         generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
@@ -98,11 +99,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         """Rows that are generated."""
         return self.image.range
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage, of two players."""
-        return ("adversarial",)
-
     def fit_statistics(self, images: RangeImages) -> None:
         """Take the scale of the images from the training scans."""
         self.image.fit(images)
@@ -110,12 +106,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
     def objective(self, stage: str) -> Objective:
         """Return the losses of the network and of a discriminator."""
         return LidarGanObjective(self.decoder, self.image, self.config)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network and the scale of its images; its discriminator has done its work."""
-        assert isinstance(objective, LidarGanObjective)
-        self.image.load_state_dict(objective.image.state_dict())
-        self.decoder.load_state_dict(objective.decoder.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
         latents = normal_latents(seeds, self.config.latent_dim).to(self.device)

@@ -117,6 +117,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     Config = LidarGenConfig
     training_precision = "fp32"  # 16 bits round away the noise of the last levels
+    trains = (("score", "network"),)
     facts = SystemFacts(
         generates="range and reflectance; a range outside a window is no return",
         paper="Zyrianov, Zhu and Wang, Learning to Generate Realistic LiDAR Point Clouds, ECCV 2022",
@@ -150,19 +151,9 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         """Return one step at each of 2 levels, so small that an untrained network's values stay in the window."""
         return LangevinSampling(levels=2, steps_each=1, step_lr=1e-9)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("score",)
-
     def objective(self, stage: str) -> Objective:
         """Return the score matching of the network."""
         return ScoreMatching(self.network, self.sensor, self.config)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network."""
-        assert isinstance(objective, ScoreMatching)
-        self.network.load_state_dict(objective.network.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: LangevinSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.shape, self.device)

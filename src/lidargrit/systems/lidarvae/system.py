@@ -97,6 +97,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     Config = LidarVaeConfig
     Sampling = VaeSampling
     not_of_sampling = frozenset({"spread", "search_steps", "search_rate"})
+    trains = (("autoencoder", "image", "encode", "decode"),)
     facts = SystemFacts(
         generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
@@ -128,11 +129,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         """Rows that are generated."""
         return self.image.range
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("autoencoder",)
-
     def fit_statistics(self, images: RangeImages) -> None:
         """Take the scale of the images from the training scans."""
         self.image.fit(images)
@@ -140,13 +136,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     def objective(self, stage: str) -> Objective:
         """Return the objective of both networks."""
         return LidarVaeObjective(self.encode, self.decode, self.image, self.config)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained networks and the scale of their images."""
-        assert isinstance(objective, LidarVaeObjective)
-        self.image.load_state_dict(objective.image.state_dict())
-        self.encode.load_state_dict(objective.encode.state_dict())
-        self.decode.load_state_dict(objective.decode.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: VaeSampling) -> RangeImage:
         return self.image.decode(self.decode(self._latents(seeds)))

@@ -86,6 +86,7 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
     """
 
     Config = R2dmConfig
+    trains = (("diffusion", "network"),)
     facts = SystemFacts(
         generates="range and reflectance; a range outside the sensor's limits is no return",
         paper="Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024",
@@ -122,11 +123,6 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         """Return 32 steps with 16 resamples each, as in the authors' demonstration."""
         return DiffusionSampling(steps=32)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("diffusion",)
-
     def fit_statistics(self, images: RangeImages) -> None:
         """Count how many of the training scans' rays return."""
         chosen = evenly_spaced(_SHARE_SCANS, len(images))
@@ -139,11 +135,6 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
     def objective(self, stage: str) -> Objective:
         """Return the denoising of the network."""
         return Denoising(self.network, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network."""
-        assert isinstance(objective, Denoising)
-        self.network.load_state_dict(objective.network.state_dict())
 
     def after_training(self) -> None:
         """Fit the threshold of the calibrated raydrop: as many values lie above it as rays returned in training."""

@@ -60,6 +60,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
     """
 
     Config = R2flowConfig
+    trains = (("flow", "network"), ("reflow", "network"), ("distillation", "network"))
     facts = SystemFacts(
         generates="range and reflectance; a range outside the sensor's limits is no return",
         paper="Nakashima et al., Fast LiDAR Data Generation with Rectified Flows, ICRA 2025",
@@ -100,11 +101,6 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
             return FlowMatching(self.network, self.sensor)
         pairs, steps = (reflow.pairs, 0) if stage == "reflow" else (reflow.distilled_pairs, reflow.distilled_steps)
         return PairMatching(self.network, self.sensor, pairs, reflow.solving, steps)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network."""
-        assert isinstance(objective, FlowMatching | PairMatching)
-        self.network.load_state_dict(objective.network.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: FlowSampling) -> RangeImage:
         return decode(self._solved(seeds, sampling).images, self.sensor)

@@ -37,6 +37,7 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
     """
 
     Config = RaydropConfig
+    trains = (("raydrop", "raydrop"),)
     facts = SystemFacts(
         generates="raydrop of clean scans; reflectance of what returns if model.raydrop.reflectance is set",
         first_command="raydrop SCANS dropped --model RUN",
@@ -58,18 +59,9 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
         """Ranges of surfaces, and pixels among them whose returns are known."""
         return frozenset({"surfaces"})
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The network alone."""
-        return ("raydrop",)
-
     def objective(self, stage: str) -> Objective:
         """Return the likelihood of which surfaces return."""
         return RaydropObjective(self.raydrop, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.raydrop.load_state_dict(objective.get_submodule(stage).state_dict())
 
     @property
     def takes(self) -> frozenset[type[Condition]]:

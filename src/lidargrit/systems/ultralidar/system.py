@@ -87,6 +87,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
     """
 
     Config = UltraLidarConfig
+    trains = (("autoencoder", "autoencoder"), ("prior", "prior"))
     facts = SystemFacts(
         generates="occupied voxels; as range images, the first on each ray, with no return where a ray meets none",
         paper="Xiong et al., UltraLiDAR: Learning Compact Representations for LiDAR Completion and Generation, "
@@ -116,20 +117,11 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         """Return 4 passes and one round."""
         return VoxelSampling(steps=4, rounds=1)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The autoencoder of voxels, then the transformer over its tokens."""
-        return ("autoencoder", "prior")
-
     def objective(self, stage: str) -> Objective:
         """Return the reconstruction of voxels, or the likelihood of hidden tokens over the frozen autoencoder."""
         if stage == "autoencoder":
             return VoxelReconstruction(self.autoencoder, self.sensor, self.config.flips)
         return HiddenVoxelTokens(self.autoencoder, self.prior, self.sensor, self.config.flips)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over a stage's trained weights."""
-        self.get_submodule(stage).load_state_dict(objective.get_submodule(stage).state_dict())
 
     @torch.no_grad()
     def sample_voxels(self, seeds: Sequence[int], sampling: VoxelSampling | None = None) -> Bool[Tensor, "B z y x"]:
