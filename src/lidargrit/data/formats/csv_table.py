@@ -16,10 +16,10 @@ from lidargrit.data.formats.shared.columns import (
     REFLECTANCE_RULE,
     check_lines,
     columns_of,
-    known_name,
     plain_text,
     scan_of_columns,
 )
+from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "lines of numbers below a line that names the columns, x, y and z among them"
@@ -83,7 +83,7 @@ class CsvTable(ScanFormat):
 
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
         return columns_of(scan)
 
     @classmethod

@@ -16,10 +16,10 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     REFLECTANCE_RULE,
     columns_of,
-    known_name,
     scan_of_columns,
 )
 from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
+from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers or of named ones, or an .npz with an array points of n rows"
@@ -89,7 +89,7 @@ class NumpyArray(ScanFormat):
 
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
         return columns_of(scan)
 
     @classmethod

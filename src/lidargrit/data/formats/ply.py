@@ -87,7 +87,7 @@ class Ply(ScanFormat):
 
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
         return columns_of(scan)
 
     @classmethod
