@@ -55,8 +55,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     """Precision in which stages are trained where no preset names one."""
 
     trains: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """Stages of training in their order: the name of each, then those of the networks, here and in its objective, that
-    it trains."""
+    """Stages of training in order, each with the names of the networks, here and in its objective, that it trains."""
 
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
