@@ -13,17 +13,19 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidargrit.core.configuration import Settings
 from lidargrit.core.typed_values import Bounds, NotNegative, Temperature
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.tokenizers import Tokenizer
-from lidargrit.generation.tokens import PixelChoice, TokenGenerator, TokenGeneratorConfig, TokenObjective
+from lidargrit.generation.tokens import (
+    DecodingOfTokens,
+    TokenGenerator,
+    TokenGeneratorConfig,
+    TokenObjective,
+)
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
 from lidargrit.nn.exact_weights import load_exactly
-from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import rngs_of, sample_index
 from lidargrit.nn.transformer import CausalTransformer
@@ -43,7 +45,7 @@ _GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
 
 
 @dataclass(frozen=True)
-class TokenSampling(Settings):
+class TokenSampling(DecodingOfTokens):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -56,43 +58,15 @@ class TokenSampling(Settings):
             of the same transformer without the attention of its last block but one, or of its only one. Above 1, scans
             and regions differ more from one another; 1 leaves the transformer's own distribution; 0 takes the model's
             setting (``model.guidance``).
-        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
-            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
-            decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
-            return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
-            decoder, and ``bernoulli`` elsewhere.
-        range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
-            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
-            with 1, a noise of 1, a correlation of 0 and a guidance of 1 follow the distribution whose likelihood the
-            model gives.
-        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
-            sampled at once; 0 samples them independently.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
-        decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
-            quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
-            has instructions for it.
     """
 
     temperature: Temperature = 1.0
     top_k: NotNegative = 0
     top_p: Annotated[float, Bounds(above=0, most=1)] = 1.0
     guidance: Annotated[float, Bounds(1, _GUIDANCE_AT_MOST, or_0=True)] = 0.0
-    mask: PixelChoice = "auto"
-    range_temperature: float = PixelSampling.range_temperature
-    range_noise: float = PixelSampling.range_noise
-    mask_correlation: float = PixelSampling.mask_correlation
     weights: WeightPrecision = "fp32"
-    decoder: Precision = "fp32"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.pixels()
-
-    def pixels(self) -> PixelSampling:
-        """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
 
 
 @dataclass(frozen=True)

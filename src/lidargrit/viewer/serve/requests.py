@@ -158,7 +158,7 @@ def upload_endings() -> list[str]:
 
 def _about(sampling: type, name: str) -> str:
     """Return what a class's docstring says of a field, in one line."""
-    text = inspect.cleandoc(sampling.__doc__ or "")
+    text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in sampling.__mro__)
     found = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
     return " ".join(found[1].split()).replace("``", "") if found else ""
 
