@@ -9,7 +9,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.data.formats import BadPoints
 from lidargrit.scans.projection import ProjectionVariant
-from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import ProjectionOption, SensorModel, load_sensor
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class DataConfig(Settings):
     sensor: str = "hdl64e_kitti_odometry"
     columns: NotNegative = 0
     column_stride: Count = 1
-    projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
+    projection: ProjectionOption = "sensor"
     projection_variant: ProjectionVariant = "exact"
     condition: str = "nothing"
     max_scans: NotNegative = 0
