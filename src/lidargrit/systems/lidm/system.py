@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.core.typed_values import Bounds, NotNegative, Share
+from lidargrit.core.typed_values import Bounds, Share
 from lidargrit.generation.encoding_cache import EncodingCache
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -52,7 +52,7 @@ class LidmConfig(Settings):
     tokenizer: TokenizerConfig = field(default_factory=CurveVqvaeConfig)
     denoiser: LatentUnetConfig = field(default_factory=LatentUnetConfig)
     scale_latents: bool = False
-    latent_axes: NotNegative = 0
+    latent_axes: int = 0
 
 
 @dataclass(frozen=True)
