@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
@@ -163,7 +163,7 @@ def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, con
             continue
         names.append(dataset.name(index))
     if not images:
-        raise DataError(f"no usable scan in {source.text}", "at least one", "see the messages above")
+        raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
     known = any(one is not None for one in filled)
     return ScanSet(source.text, RangeImage.stack(images), tuple(names), filled=marks if known else None)

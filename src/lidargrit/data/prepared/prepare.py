@@ -156,7 +156,7 @@ def prepare_and_describe(
     for remark in images.remarks():
         reporting.message(remark)
     if not len(images):
-        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+        raise no_usable_scan(source)
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
     shape = images.sensor.height, images.sensor.width
     return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))

@@ -337,4 +337,4 @@ def _require_some(text: str, prepared: PreparedImages) -> None:
     for remark in prepared.remarks():
         reporting.message(remark)
     if not len(prepared):
-        raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")
+        raise no_usable_scan(text)

@@ -7,9 +7,9 @@ from jaxtyping import Float64, Shaped
 from torch import Tensor
 
 from lidargrit.data import formats
-from lidargrit.data.export import IMAGE, TREE, writable_format, write_with_labels
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.shared.columns import quantity_of
+from lidargrit.data.scan_folder import IMAGE, TREE, writable_format, write_with_labels
 from lidargrit.inference.complete.cloud import CompletedScan
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.types import Scan
