@@ -89,10 +89,6 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
     Returns:
         Number of scans that are there now.
 
-    Raises:
-        ConfigError: no scan, no process, or more frames than a street has.
-        OutputError: the folder holds something else.
-        DataError: a street of which no ray returns.
     """
     if num_scans < 1 or workers < 1:
         raise ConfigError(

@@ -44,12 +44,6 @@ def export_scans(
     Returns:
         Number of scans that are there now.
 
-    Raises:
-        UnknownNameError: no such format.
-        ConfigError: a sensor for a source that has its own.
-        OutputError: the folder holds something else, lies in the source, or cannot be written.
-        DataError: no such source, or no usable scan in it.
-        ScanError: a scan that cannot be used.
     """
     config = config or DataConfig()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))

@@ -48,9 +48,6 @@ class ScanFolder:
     Attributes:
         missing: indices of the files that are still to be written.
 
-    Raises:
-        DataError: several scans that would be one file.
-        OutputError: a link in place of a file.
     """
 
     def __init__(
@@ -87,9 +84,6 @@ class ScanFolder:
             what: what is done, for the bar.
             remaining: number of scans that it is done with; those that are missing if not given.
 
-        Raises:
-            OutputError: the folder holds something else, or another scan in one of the files.
-            DataError: every scan was left out.
         """
         total = len(self.files)
         done = total - (len(self.missing) if remaining is None else remaining)
@@ -157,8 +151,6 @@ def begun_by(manifest: Path, difference: Callable[[dict[str, Any]], str]) -> dic
         manifest: file in the folder.
         difference: function of the manifest, in words how another command wrote it ("which holds ..."); "" if the same.
 
-    Raises:
-        OutputError: the folder holds something else, or what another command wrote.
     """
     is_ours_or_taken = is_taken(manifest.parent)  # asked first: another process may begin it just now
     if manifest.is_file():
@@ -174,11 +166,7 @@ def begun_by(manifest: Path, difference: Callable[[dict[str, Any]], str]) -> dic
 
 
 def check_names(source: str, names: Sequence[str]) -> None:
-    """Raise DataError if several scans of a source have one name, or would be one file: the last would replace others.
-
-    Args:
-        names: name or file of each scan.
-    """
+    """Raise DataError if several scans of a source would be one file: the last would replace others."""
     if twice := sorted(name for name, count in Counter(names).items() if count > 1):
         got = f"several scans of {source} that would be {twice[0]}"
         raise DataError(got, "a name for each scan, as each becomes a file", "rename some, or take their folders apart")
@@ -232,11 +220,8 @@ def writable_format(kind: str, *others: str) -> tuple[type[ScanFormat], str]:
     """Return the format of a name or an ending, and the ending of its files.
 
     Args:
-        kind: name or ending.
         others: words that the command takes besides, to be named in the message.
 
-    Raises:
-        UnknownNameError: no such format, or one that cannot be written.
     """
     if kind in discovery.names("formats"):
         form, suffix = formats.load(kind), formats.load(kind).suffixes[0]

@@ -81,8 +81,6 @@ class Benchmark:
         Args:
             check: whether it is still to be trained, so that its stages have to follow the settings.
 
-        Raises:
-            ConfigError: a setting that the preset does not take, or that one of its stages cannot follow.
         """
         preset = load_preset(name, self.preset_settings)
         if check:
@@ -107,9 +105,6 @@ def run(
         benchmark: settings that all systems share.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
 
-    Raises:
-        ConfigError: a system that occurs twice, or a preset that does not take a setting.
-        OutputError: another comparison writes into the folder, or it cannot be written to.
     """
     names = [_folder_name(system) for system in systems]
     if len(set(names)) < len(names) or not names:

@@ -44,9 +44,6 @@ def evaluate(
     Returns:
         a table, its plain values, and a function that writes the report, None where none is wanted.
 
-    Raises:
-        ConfigError: a name is missing, or an option has no meaning for these sets or metrics.
-        OutputError: the report is there already.
     """
     if not (samples and reference):
         got = f"{samples!r} alone" if samples else "nothing to score"
@@ -74,8 +71,6 @@ def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) ->
         options: values of all options, by their names.
         default_of: function that returns the default of an option.
 
-    Raises:
-        ConfigError: they are mixed.
     """
     of_scoring = [name for name, value in options.items() if name not in _OF_TABLES and value != default_of(name)]
     if options["tables"] and of_scoring:
@@ -98,15 +93,12 @@ def read_config(
     """Turn words and numbers, as a user types them, into a configuration.
 
     Args:
-        scans: settings of reading scans.
         metrics: names of metrics, in place of the protocol's.
         weights: words such as ``pointnet=FILE``.
         groups: number of groups that each set is cut into.
         intervals: number of half-samples; 0 for no intervals.
         settings: further settings of :class:`EvalConfig`, by name.
 
-    Raises:
-        ConfigError: a setting out of its bounds, or weights of a network that no metric uses.
     """
     scans = scans or ScanSettings()
     settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans

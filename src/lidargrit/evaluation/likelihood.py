@@ -108,12 +108,8 @@ def score_likelihood(
 
     Args:
         generator: model with the capability ``likelihood``.
-        images: range images of its sensor.
         maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
 
-    Raises:
-        ConfigError: a model without probabilities, images of another sensor, or a step that is not one.
-        OutputError: the file cannot be written.
     """
     parts: dict[str, list[float]] = {}
     sensor, returns, whole = images.sensor, [], False
@@ -180,13 +176,9 @@ def likelihood_of_source(
     """Return the bits of the scans of a source by a finished run.
 
     Args:
-        text: source of scans.
         model: finished run; scans are projected with its sensor, in the way of its training.
         maps: file to write the bits of every pixel to; none if not given.
 
-    Raises:
-        ConfigError: a model without probabilities, or a step that is not one.
-        DataError: no usable scan, or scans of another sensor.
     """
     run = RunSource(model, locate(model))
     variant = run.projection_variant(config) or config.projection_variant

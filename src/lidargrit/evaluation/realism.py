@@ -75,9 +75,6 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
         real: real scans, at least two, in the order of their recording.
         curves: names of metrics. ``reflectance_histogram`` is left out where a real scan has no reflectance.
 
-    Raises:
-        ConfigError: the two look along different rays.
-        DataError: fewer than two real scans.
     """
     _require_two(real)
     if not simulated.clean.sensor.same_rays(real.sensor):
@@ -163,7 +160,6 @@ def simulate_pair(seed: int, rays: SensorModel, firing: SensorModel | None = Non
     """Simulate one scan and return both of its images: see :func:`pair_of`.
 
     Args:
-        rays: rays of the images.
         firing: sensor that fires. If it has other columns than ``rays``, all of its points are projected, so that the
             nearest of several may fill a pixel, as in a real scan. If not given, it fires once for each pixel.
     """

@@ -139,9 +139,6 @@ class ReconstructionScore:
             clean_range_m: decoded range (B, H, W) of every pixel in metres, without ray drop.
             return_mask: decoded mask (B, H, W), True = a return.
 
-        Raises:
-            ConfigError: the two pair differ in shape.
-            ScanError: a decoded range is not a number where the real scan has a return.
         """
         if not real.range_m.shape == clean_range_m.shape == return_mask.shape:
             raise ConfigError(
@@ -175,11 +172,7 @@ class ReconstructionScore:
             setattr(self, key, getattr(self, key) + value)
 
     def compute(self) -> ReconstructionErrors:
-        """Return the errors over all pairs so far.
-
-        Raises:
-            DataError: no pair, or not one return in the real scans.
-        """
+        """Return the errors over all pairs so far."""
         num_returns = self._only_decoded + self._neither
         if not num_returns:
             raise DataError(
@@ -217,15 +210,7 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
 
 
 def score_run(run: RunSource, source: Source, config: DataConfig, device: str = "cpu") -> dict[str, float]:
-    """Return how well the tokenizer of a finished run reconstructs scans, by the name of each error.
-
-    Args:
-        run: finished run.
-        source: scans that the tokenizer encodes and decodes.
-
-    Raises:
-        ConfigError: a run whose generator has no tokenizer.
-    """
+    """Return how well the tokenizer of a finished run reconstructs scans, by the name of each error."""
     generator = load(run.folder).to(device)
     tokenizer = generator.get_tokenizer()
     images = source.images(run.sensor, config)

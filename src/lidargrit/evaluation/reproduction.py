@@ -167,8 +167,6 @@ def reproduce(wanted: Reproduction, folder: Path) -> list[Path]:
         folder: output folder, as in :func:`lidargrit.evaluation.benchmark.run`. The same call continues there:
             prepared scans (in the cache), checkpoints, samples and scores are not made again.
 
-    Raises:
-        DataError: the root does not hold the data set, or a split of it.
     """
     benchmark, systems = wanted.benchmark(), wanted.systems()
     _prepare(benchmark, list(systems.values()))

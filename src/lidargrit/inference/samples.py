@@ -43,9 +43,6 @@ def write_samples(
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
 
-    Raises:
-        OutputError: the folder holds samples of another model or setting, something else, cannot be written, or was
-            removed while its samples were written.
     """
     sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {

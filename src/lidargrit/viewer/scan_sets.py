@@ -69,11 +69,6 @@ def load_scan_sets(
             with those that its image keeps. It has no effect if the settings give a number of columns, beside samples
             and runs, nor with a ``sensor``.
 
-    Raises:
-        ConfigError: no source.
-        UsageError: runs, and a later seed of theirs is above the largest one.
-        DataError: no usable scan in a source.
-        ScanError: a scan that cannot be used, unless such scans are skipped.
     """
     settings = settings or ScanSettings()
     config = settings.data

@@ -88,11 +88,7 @@ class Las(ScanFormat):
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write columns to a new file.
-
-        Raises:
-            OutputError: laspy is not installed, or a coordinate beyond 214 km.
-        """
+        """Write columns to a new file."""
         try:
             import laspy  # noqa: PLC0415  an optional part
         except ImportError:

@@ -60,9 +60,6 @@ def prepare(
     Returns:
         the folder, complete.
 
-    Raises:
-        OutputError: the folder holds something else, or images of scans or settings that have changed since.
-        ScanError: a scan that cannot be used; names it.
     """
     sensor = sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
@@ -95,7 +92,6 @@ class Prepared:
     """Size and content of a prepared folder.
 
     Args:
-        images: number of images.
         rows: number of rows of an image.
         columns: number of fine columns of an image.
         size: size of all shards, in bytes.
@@ -139,8 +135,6 @@ def prepare_and_describe(
         source, dataset, config, folder, rank, world_size: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
 
-    Raises:
-        OutputError, ScanError: as for :func:`prepare`.
     """
     begun = time.monotonic()
     imaging = choose_imaging(source, dataset, config.load_sensor(), config)

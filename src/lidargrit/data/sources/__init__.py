@@ -74,7 +74,6 @@ class DatasetSource(Source):
 
         Args:
             sensor: sensor of the images; the data set's own, with the configuration's columns, if not given.
-            config: settings of the projection.
         """
         return choose_imaging(self.text, self._dataset, sensor or config.imaged(self.sensor), config)
 
@@ -191,11 +190,7 @@ class RunSource(Source):
         return recorded_projection(self.folder)
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
-        """Refuse: scans have to be generated first.
-
-        Raises:
-            DataError: always.
-        """
+        """Refuse: scans have to be generated first."""
         cure = f"generate some first with: lidargrit sample {self.text} FOLDER"
         raise DataError(f"{self.text}, which holds {self.kind}", "scans or samples", cure)
 
@@ -304,7 +299,6 @@ def overlap(source: Source, images: RangeImages | None, reference: RangeImages) 
 
     Args:
         source: source of the set; of samples and runs, the training scans of the model count, too.
-        images: images of the set, where it holds any.
         reference: set that it is compared with.
     """
     own = Provenance() if images is None else images.provenance

@@ -35,8 +35,6 @@ class CompletedScan:
 
         Reflectance, ring and label are there where the scan has them; ``filled`` marks what was added.
 
-        Raises:
-            ScanError: every point was dropped.
         """
         own, added = self.scan, self.filled
         parts = [own.points_xyz_m, own.reflectance, own.ring, own.label]
@@ -71,8 +69,6 @@ def filled_scan(seen: InputScan, condition: Observed, images: RangeImage, hides:
 
     Args:
         seen: scan on its rays, which are several images of the model.
-        condition: observed part of each of these images.
-        images: the model's completion of each.
         hides: whether measured points outside the observed pixels are left out.
     """
     grid = seen.rays

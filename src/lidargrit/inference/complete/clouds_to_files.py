@@ -41,9 +41,7 @@ def write_cloud(path: Path, kind: str, done: CompletedScan, form: type[ScanForma
     Of an added point, columns that a scan has no room for have the value of the measured point nearest to its ray.
 
     Args:
-        path: path of the new file.
         kind: name or ending of the wanted format; "" for the scan's own.
-        done: completed cloud.
         form: format of the scan's file; None if it was in none.
     """
     whole = done.whole()

@@ -106,10 +106,6 @@ def write_completions(
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
 
-    Raises:
-        ConfigError: several completions by what completes a scan in one way.
-        OutputError: the folder holds something else, lies in the source, or cannot be written.
-        ScanError, DataError: a scan that cannot be used, no usable one, or two that would be one file.
     """
     inputs.check_output(out)
     files, facts = _files(inputs, str(facts["source"]), output), facts | _facts(model, output)

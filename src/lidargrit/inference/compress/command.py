@@ -51,11 +51,6 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         config: number of scans, and what to do with unusable points and scans.
 
-    Raises:
-        ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
-        DataError: no usable scan, or two of one name.
-        OutputError: an unfinished file of another command, or one that cannot be written.
-        ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
     reader = ScanReader(codec.sensor, projection_variant(locate(model)))
@@ -96,15 +91,9 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     Args:
         path: file that :func:`compress_scans` wrote.
         out: an empty folder, or one that the same command began: files that are there are not written again.
-        model: run by which it was compressed.
         kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
         chosen: indices of the scans that are wanted; all if there is none.
 
-    Raises:
-        ScanError: a file that was cut off or altered, or that this machine cannot reproduce.
-        CheckpointError: another model than the file's.
-        UnknownNameError: a format that is none, or that cannot be written.
-        UsageError: an index that the file does not have.
     """
     form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     archive = Archive(path)

@@ -45,17 +45,11 @@ def segment_scans(
         out: an empty folder, or one that the same command began.
         model: segmenter; see :func:`.open_segmenter`.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        device: device to compute on.
         numbering: numbering of the scans' own labels, with which the found ones are compared; "" for no comparison.
 
     Returns:
         number of scans that are there now, and how well their own labels were found, None without a comparison.
 
-    Raises:
-        ConfigError: a run that does not label scans, range images of other rows, or own labels of another numbering.
-        ScanError: a scan that cannot be used, or of another sensor.
-        DataError: no usable scan, or own labels are missing where they are to be compared.
-        OutputError: the folder holds something else, lies in the source, or cannot be written.
     """
     config = config or DataConfig()
     segmenter = open_segmenter(model, device)

@@ -23,9 +23,6 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     Args:
         sequence: folder that holds the files; a time or pose without its files is unknown.
 
-    Raises:
-        DataError: a file that is no table of finite numbers, times that do not rise, or poses without ``Tr``.
-
     Source:
         Geiger et al., CVPR 2012, readme.txt of the odometry benchmark's development kit.
     """

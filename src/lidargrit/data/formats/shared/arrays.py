@@ -64,11 +64,7 @@ def scan_from_points(
 
 
 def scan_of(points: Points) -> Scan:
-    """Return a scan as it is, and points in an array as a scan.
-
-    Raises:
-        ScanError: something else, or points that cannot be used.
-    """
+    """Return a scan as it is, and points in an array as a scan."""
     if isinstance(points, Scan):
         return points
     if isinstance(points, (np.ndarray, Tensor)):

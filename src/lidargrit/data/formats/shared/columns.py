@@ -55,9 +55,6 @@ def scan_of_columns(
         are_named: whether the file itself has the names; where it has not, reflectance that is none shows another
             layout, and is refused.
 
-    Raises:
-        ScanError: x, y or z is not there, rings or labels are not whole numbers, rings are counted from 1, or the
-            points are unfit.
     """
     named = {_plain(name): values for name, values in reversed(list(columns.items()))}
     if not {"x", "y", "z"} <= named.keys():
@@ -124,11 +121,7 @@ def plain_text(data: bytes) -> bytes:
 
 
 def check_lines(data: bytes, path: Path, wanted: str) -> None:
-    """Refuse text with a line longer than any of numbers: NumPy takes twenty times the memory of a line.
-
-    Raises:
-        ScanError: such a line.
-    """
+    """Refuse text with a line longer than any of numbers: NumPy takes twenty times the memory of a line."""
     start = 0
     while len(data) - start > _LINE_BYTES_AT_MOST:
         start = data.rfind(b"\n", start, start + _LINE_BYTES_AT_MOST) + 1
@@ -138,11 +131,7 @@ def check_lines(data: bytes, path: Path, wanted: str) -> None:
 
 
 def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str) -> dict[str, np.ndarray]:
-    """Read rows of numbers between blanks.
-
-    Raises:
-        ScanError: fewer rows, other columns, or no numbers.
-    """
+    """Read rows of numbers between blanks."""
     promised = f"the {rows} rows of {len(names)} numbers that its header says"
     if 2 * rows * len(names) > len(data) + 1:  # a number takes a digit and a blank; room is made for all rows at once
         raise ScanError(f"{len(data)} bytes of text in {path}", promised, "download it again: the file was cut short")

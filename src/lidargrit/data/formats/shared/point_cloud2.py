@@ -18,8 +18,6 @@ def columns_of_cloud(cloud: Any) -> tuple[dict[str, np.ndarray], tuple[str, ...]
     first counts. ``row_step`` tells where rows begin, if there are several; where they cannot begin there, points
     follow one another without gaps.
 
-    Raises:
-        ValueError: fewer bytes than points.
     """
     notes, fields = [], {}
     size = int(cloud.point_step)

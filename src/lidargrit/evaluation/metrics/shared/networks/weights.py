@@ -65,8 +65,6 @@ def find_weights(published: PublishedWeights, given: Path | None = None) -> Path
 
     It is looked for in ``$LIDARGRIT_WEIGHTS`` and in ``weights`` in the cache, by the name that it has at its source.
 
-    Raises:
-        WeightsError: it lies nowhere and cannot be fetched; says from where to get it, and on which terms.
     """
     if given is not None:
         return given
@@ -86,8 +84,6 @@ def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Ten
         the tensors, float32, in memory of their own, without the counters that networks in training keep; and the
         SHA-256 of the file.
 
-    Raises:
-        WeightsError: no file, too large a one, another checksum than is known, or anything in it but float32 tensors.
     """
     if not path.is_file():  # a pipe would hang
         raise _unfit(published, f"{path}, which is no file")
