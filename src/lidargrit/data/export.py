@@ -8,6 +8,7 @@ from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, printable
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, writable_format
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans

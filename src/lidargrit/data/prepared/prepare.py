@@ -12,7 +12,7 @@ from typing import Any
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
-from lidargrit.core.errors import DataError, OutputError, counted_scans
+from lidargrit.core.errors import DataError, OutputError, counted_scans, no_usable_scan
 from lidargrit.core.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import DataError, LidarGritError
+from lidargrit.core.errors import DataError, LidarGritError, no_usable_scan
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
