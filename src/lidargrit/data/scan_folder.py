@@ -42,7 +42,7 @@ class ScanFolder:
         manifest: name of the file that says how the scans were made, and which file holds which.
         facts: entries of the manifest, among them the ``source``; a folder with other entries is refused.
         files: file of each scan, below the folder.
-        identities: what identifies the scan in each file.
+        identities: identity of the scan in each file, such as its name in the source.
         bad_scans: treatment of a scan that cannot be used.
 
     Attributes:
@@ -81,7 +81,7 @@ class ScanFolder:
         removed again.
 
         Args:
-            what: what is done, for the bar.
+            what: name of the work, for the bar.
             remaining: number of scans that it is done with; those that are missing if not given.
 
         """
