@@ -88,7 +88,6 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
 
     Returns:
         Number of scans that are there now.
-
     """
     if num_scans < 1 or workers < 1:
         raise ConfigError(

@@ -44,7 +44,6 @@ def export_scans(
 
     Returns:
         Number of scans that are there now.
-
     """
     config = config or DataConfig()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))

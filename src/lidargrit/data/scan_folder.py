@@ -47,7 +47,6 @@ class ScanFolder:
 
     Attributes:
         missing: indices of the files that are still to be written.
-
     """
 
     def __init__(
@@ -83,7 +82,6 @@ class ScanFolder:
         Args:
             what: name of the work, for the bar.
             remaining: number of scans that it is done with; those that are missing if not given.
-
         """
         total = len(self.files)
         done = total - (len(self.missing) if remaining is None else remaining)
@@ -150,7 +148,6 @@ def begun_by(manifest: Path, difference: Callable[[dict[str, Any]], str]) -> dic
     Args:
         manifest: file in the folder.
         difference: function of the manifest, in words how another command wrote it ("which holds ..."); "" if the same.
-
     """
     is_ours_or_taken = is_taken(manifest.parent)  # asked first: another process may begin it just now
     if manifest.is_file():
@@ -221,7 +218,6 @@ def writable_format(kind: str, *others: str) -> tuple[type[ScanFormat], str]:
 
     Args:
         others: words that the command takes besides, to be named in the message.
-
     """
     if kind in discovery.names("formats"):
         form, suffix = formats.load(kind), formats.load(kind).suffixes[0]

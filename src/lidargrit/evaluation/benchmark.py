@@ -80,7 +80,6 @@ class Benchmark:
 
         Args:
             check: whether it is still to be trained, so that its stages have to follow the settings.
-
         """
         preset = load_preset(name, self.preset_settings)
         if check:
@@ -104,7 +103,6 @@ def run(
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
-
     """
     names = [_folder_name(system) for system in systems]
     if len(set(names)) < len(names) or not names:

@@ -43,7 +43,6 @@ def evaluate(
 
     Returns:
         a table, its plain values, and a function that writes the report, None where none is wanted.
-
     """
     if not (samples and reference):
         got = f"{samples!r} alone" if samples else "nothing to score"
@@ -70,7 +69,6 @@ def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) ->
     Args:
         options: values of all options, by their names.
         default_of: function that returns the default of an option.
-
     """
     of_scoring = [name for name, value in options.items() if name not in _OF_TABLES and value != default_of(name)]
     if options["tables"] and of_scoring:
@@ -98,7 +96,6 @@ def read_config(
         groups: number of groups that each set is cut into.
         intervals: number of half-samples; 0 for no intervals.
         settings: further settings of :class:`EvalConfig`, by name.
-
     """
     scans = scans or ScanSettings()
     settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans

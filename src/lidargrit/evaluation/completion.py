@@ -91,7 +91,6 @@ def compare_completion(
 
     Returns:
         scores of all models by the first pattern, then by the next.
-
     """
     if not len(images) or completions < 1:
         raise DataError(

@@ -105,7 +105,6 @@ def costs_block(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) 
     Args:
         files: name of each system, and its ``costs.json``.
         remarks: lines to print below the costs.
-
     """
     rows = []
     for name, path in files:

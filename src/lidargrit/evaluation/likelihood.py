@@ -109,7 +109,6 @@ def score_likelihood(
     Args:
         generator: model with the capability ``likelihood``.
         maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
-
     """
     parts: dict[str, list[float]] = {}
     sensor, returns, whole = images.sensor, [], False
@@ -178,7 +177,6 @@ def likelihood_of_source(
     Args:
         model: finished run; scans are projected with its sensor, in the way of its training.
         maps: file to write the bits of every pixel to; none if not given.
-
     """
     run = RunSource(model, locate(model))
     variant = run.projection_variant(config) or config.projection_variant

@@ -132,7 +132,6 @@ def pair_for_protocol(
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.
         sensor: sensor that scans are imaged with, in place of the protocol's; samples that are images keep theirs.
-
     """
     sensor = sensor or protocol.load_sensor()
     config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))

@@ -56,7 +56,6 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
         scans: kind of the scans; see :class:`RaydropScore`.
         clean: batch of range images in which every surface returns.
         true: measured range images of the same scans, with true drops.
-
     """
     _check(generator)
     dropped = []
@@ -83,7 +82,6 @@ def raydrop_model(word: str, device: str = "") -> Generator:
 
     Args:
         word: folder of a finished run, or ``pretrained``.
-
     """
     generator = load(word).to(usable_device(device))
     _check(generator)
@@ -98,7 +96,6 @@ def scores_of_model(generator: Generator, simulated: SimulatedScans, real: Range
         generator: model of :func:`raydrop_model`.
         simulated: simulated scans of the run's sensor, before and after drops.
         real: real scans of its sensor.
-
     """
     decoded, true = decoded_surfaces(generator, real)
     pairs = {
@@ -117,7 +114,6 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
 
     Args:
         real: scans of its sensor.
-
     """
     _check_tokenizer(generator)
     if not generator.sensor.same_rays(real.sensor):

@@ -74,7 +74,6 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
         simulated: scans of the real ones' sensor, as many as wanted.
         real: real scans, at least two, in the order of their recording.
         curves: names of metrics. ``reflectance_histogram`` is left out where a real scan has no reflectance.
-
     """
     _require_two(real)
     if not simulated.clean.sensor.same_rays(real.sensor):

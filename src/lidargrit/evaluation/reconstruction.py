@@ -138,7 +138,6 @@ class ReconstructionScore:
             real: batch of scans that the tokenizer encoded.
             clean_range_m: decoded range (B, H, W) of every pixel in metres, without ray drop.
             return_mask: decoded mask (B, H, W), True = a return.
-
         """
         if not real.range_m.shape == clean_range_m.shape == return_mask.shape:
             raise ConfigError(

@@ -166,7 +166,6 @@ def reproduce(wanted: Reproduction, folder: Path) -> list[Path]:
         wanted: the table and its data.
         folder: output folder, as in :func:`lidargrit.evaluation.benchmark.run`. The same call continues there:
             prepared scans (in the cache), checkpoints, samples and scores are not made again.
-
     """
     benchmark, systems = wanted.benchmark(), wanted.systems()
     _prepare(benchmark, list(systems.values()))

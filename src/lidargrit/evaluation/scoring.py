@@ -100,7 +100,6 @@ def score_metrics(
 
     Returns:
         the score of each metric, or why it could not be computed: no weights, no reflectance, too few scans.
-
     """
     found: dict[int, Score | LidarGritError] = {}
     together: dict[Hashable, list[int]] = {}

@@ -42,7 +42,6 @@ def write_samples(
         folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
-
     """
     sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {

@@ -37,7 +37,6 @@ def import_weights(preset: str, folder: Path, files: Sequence[Path], settings: S
         folder: folder that gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
         files: files of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
         settings: changed settings of the preset, such as ``data.projection_variant=reference``.
-
     """
     if not (folder / RUN_FILE).is_file():
         _refuse_taken(folder, None)  # before much is read
@@ -78,7 +77,6 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
 
     Returns:
         Text of the card.
-
     """
     run = locate(run)
     generator = load(run)

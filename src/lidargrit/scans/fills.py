@@ -303,7 +303,6 @@ def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
 
     Blocks of pixels are divided at random into two halves, and each half is triangulated from the returns of the other.
     So returned and dropped rays cannot be distinguished by the noise of a measured range.
-
     """
     sensor, device = images.sensor, images.range_m.device
     height, width = sensor.height, sensor.width

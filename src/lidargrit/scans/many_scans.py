@@ -34,7 +34,6 @@ def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -
         dataset: scans to choose from.
         indices: numbers of the wanted scans, in order.
         at_most: number of usable scans after which no further one is read; 0 for all.
-
     """
     scans, skipped = list[Scan](), list[str]()
     error = None

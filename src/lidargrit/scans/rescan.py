@@ -43,7 +43,6 @@ class Rescan:
     Args:
         other: sensor whose clouds are wanted.
         raised_m: height in metres of the other sensor above the first; points are in its own frame.
-
     """
 
     sensor: SensorModel

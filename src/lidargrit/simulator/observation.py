@@ -101,7 +101,6 @@ class Observation:
 
         Args:
             limits_m: nearest and farthest range of a surface, in metres.
-
         """
         within = (self.clean_range_m >= limits_m[0]) & (self.clean_range_m <= limits_m[1]) & ~self.blocked
         marks = mark(torch.from_numpy(self.return_mask), torch.from_numpy(self.reflectance)).numpy()

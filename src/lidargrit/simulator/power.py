@@ -56,7 +56,6 @@ class RaydropModel:
             films of water darken rough ground.
         wet_gloss: strength of the mirror-like lobe of soaked ground. Assumed: 0.02, as Fresnel's law has it for water.
         materials: reflection properties of all materials.
-
     """
 
     least_power: float = 2.5e-6

@@ -34,7 +34,6 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
     Args:
         title: title of the whole picture.
-
     """
     if not scores:
         raise ConfigError("no curve", "at least one", "compare some scans first")

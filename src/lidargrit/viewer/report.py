@@ -47,7 +47,6 @@ def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
     Args:
         card: scores and facts of the evaluation.
         pair: the two sets of scans that were compared.
-
     """
     write_text(path, page(card, pair))
 

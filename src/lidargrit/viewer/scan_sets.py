@@ -68,7 +68,6 @@ def load_scan_sets(
         all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
             with those that its image keeps. It has no effect if the settings give a number of columns, beside samples
             and runs, nor with a ``sensor``.
-
     """
     settings = settings or ScanSettings()
     config = settings.data

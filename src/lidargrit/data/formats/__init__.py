@@ -177,7 +177,6 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
     Args:
         index: number of the scan in the file, from 0.
         bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
-
     """
     form = recognise(Path(path))
     if index:  # counting reads a whole recording

@@ -59,7 +59,6 @@ def prepare(
 
     Returns:
         the folder, complete.
-
     """
     sensor = sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
@@ -134,7 +133,6 @@ def prepare_and_describe(
     Args:
         source, dataset, config, folder, rank, world_size: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
-
     """
     begun = time.monotonic()
     imaging = choose_imaging(source, dataset, config.load_sensor(), config)

@@ -97,7 +97,6 @@ class PreparedFolder:
 
     Args:
         location: path on this machine, or a URL that fsspec opens, such as s3://bucket/scans.
-
     """
 
     def __init__(self, location: str) -> None:
@@ -128,7 +127,6 @@ class PreparedFolder:
         Args:
             kind: required type of the whole, dict or list.
             at_most: largest size, in bytes.
-
         """
         file = self.open(name)
         data, wanted = bytes(file.read(0, min(file.size, at_most + 1))), "what lidargrit prepare wrote"
@@ -191,7 +189,6 @@ class PreparedImages:
 
     Args:
         location: path of the folder, or its URL.
-
     """
 
     def __init__(self, location: str) -> None:
@@ -273,7 +270,6 @@ class PreparedImages:
         Args:
             variant: projection variant that is wanted. The reference's columns cannot be gathered into fewer: it rounds
                 points to the nearest column.
-
         """
         location, prepared, wanted = self._folder.location, self.sensor, sensor.fine()
         is_wider = variant == "exact" and has_fewer_columns(wanted, prepared)
@@ -302,7 +298,6 @@ class PreparedImages:
         Args:
             index: number of the image.
             verify: whether to compare the pixels with their fingerprint.
-
         """
         shard, entry = self._entries[index]
         name = f"{self._folder.location}/{shard_name(shard)}"

@@ -50,7 +50,6 @@ def make_shard(
         shard: number of the shard.
         dataset: source of the scans.
         advance: function that receives the number of further scans done.
-
     """
     wanted = evenly_spaced(spec.max_scans or len(dataset), len(dataset))
     if len(wanted) != spec.num_scans:

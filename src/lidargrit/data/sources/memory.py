@@ -17,7 +17,6 @@ class MemorySource(Source):
 
     Args:
         scans: points of each scan.
-
     """
 
     kind = "scans in memory"

@@ -25,7 +25,6 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     Args:
         folder: folder that :func:`lidargrit.inference.samples.write_samples` wrote.
         count: largest number of scans, evenly spaced over the seeds; all if not given.
-
     """
     manifest = read_json(folder / MANIFEST)
     try:

@@ -34,7 +34,6 @@ class CompletedScan:
         """Return the points that stay, in their order and bit for bit, then those that were added.
 
         Reflectance, ring and label are there where the scan has them; ``filled`` marks what was added.
-
         """
         own, added = self.scan, self.filled
         parts = [own.points_xyz_m, own.reflectance, own.ring, own.label]

@@ -29,7 +29,6 @@ def complete_scans(
 
     Returns:
         what was written, and how many points came in and went out.
-
     """
     config = config or DataConfig()
     inputs = open_inputs(source, task.reader(model.sensor, model.projection_variant), config)

@@ -105,7 +105,6 @@ def write_completions(
         task, output: work on each scan; number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
-
     """
     inputs.check_output(out)
     files, facts = _files(inputs, str(facts["source"]), output), facts | _facts(model, output)

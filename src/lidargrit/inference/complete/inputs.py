@@ -131,7 +131,6 @@ class Inputs:
         Args:
             see: function that brings a cloud to the rays that all of its points lie on; not given, it becomes one image
                 of the reader's sensor. A range image stays as it is.
-
         """
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
@@ -220,7 +219,6 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
-
     """
     scans = named_scans(open_source(source, config.bad_points), config, reader.sensor)
     if isinstance(scans, ImageScans) and not scans.images.sensor.same_rays(reader.sensor):

@@ -60,7 +60,6 @@ class Pattern:
 
         Args:
             seed: seed of the pixels that ``pixels:SHARE`` chooses; each further image has others.
-
         """
         masks = torch.stack([self._mask(images[at], phase_seed(seed, at)) for at in range(len(images))])
         if self.text == "returns" and bool(masks.all()):

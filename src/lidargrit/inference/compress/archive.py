@@ -70,7 +70,6 @@ def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = 
     Args:
         header: facts that all scans have in common, as JSON.
         chosen: options that say which scans these are, as JSON, to be kept beside an unfinished file.
-
     """
     folder = path.with_name(path.name + UNFINISHED)
     scans, index, options = folder / "scans", folder / "index", folder / "options.json"
@@ -106,7 +105,6 @@ class ArchiveWriter:
         scans: file of the header and the scans, open to be read and appended to.
         index: file of the lines of the index, open to be read and appended to.
         header: facts that all scans have in common, as JSON.
-
     """
 
     def __init__(self, scans: BinaryIO, index: BinaryIO, header: dict[str, Any], folder: Path) -> None:
@@ -126,7 +124,6 @@ class ArchiveWriter:
         """Keep the options of the command, unless the file was begun with others: scans may all have the same names.
 
         A command that stopped at a bad point or scan may go on without it.
-
         """
         begun = read_json(path) if path.exists() else chosen
         changed = [name for name, of in chosen.items() if begun.get(name) not in (of, *_STRICTER.get(name, ()))]
@@ -139,7 +136,6 @@ class ArchiveWriter:
 
         Args:
             identities: identity of each of the scans that are to be written.
-
         """
         self._scans.seek(len(self._start))
         self._index.seek(0)
@@ -203,7 +199,6 @@ class Archive:
 
     Attributes:
         index_crc32: checksum of the index, which tells two files of scans with the same names apart.
-
     """
 
     def __init__(self, path: Path) -> None:

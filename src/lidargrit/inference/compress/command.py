@@ -50,7 +50,6 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         config: number of scans, and what to do with unusable points and scans.
-
     """
     codec = ScanCodec(load(model), step_mm)
     reader = ScanReader(codec.sensor, projection_variant(locate(model)))
@@ -93,7 +92,6 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         out: an empty folder, or one that the same command began: files that are there are not written again.
         kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
         chosen: indices of the scans that are wanted; all if there is none.
-
     """
     form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     archive = Archive(path)

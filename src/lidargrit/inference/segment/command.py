@@ -49,7 +49,6 @@ def segment_scans(
 
     Returns:
         number of scans that are there now, and how well their own labels were found, None without a comparison.
-
     """
     config = config or DataConfig()
     segmenter = open_segmenter(model, device)

@@ -139,7 +139,6 @@ def fit_sensor_to_dataset(
         dataset: scans, see :func:`lidargrit.data.datasets.open_dataset`.
         num_scans: largest number of scans to use; 0 for all.
         bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` it with a warning.
-
     """
     if num_scans < 0:
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")

@@ -76,7 +76,6 @@ def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
 
     Args:
         theme: dense city, suburb with gardens, open country, or mixed: chosen at random, mostly suburb and city.
-
     """
     if theme not in get_args(Theme):
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of these")

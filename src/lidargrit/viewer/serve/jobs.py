@@ -48,7 +48,6 @@ class JobQueue:
         runs: folders of finished runs.
         folder: an empty folder for uploads and results; the caller removes it.
         limits: bounds on what may be asked for.
-
     """
 
     def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits | None = None) -> None:

@@ -103,7 +103,6 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
         values: values by name; a missing one has its default.
         settings: sampling settings of each model that is served.
         limits: bounds on what may be asked for.
-
     """
     known = ("model", "seed", "count", "sampling", "task", "region", "name")
     for name in values:

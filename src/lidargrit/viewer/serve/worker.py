@@ -126,7 +126,6 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     Args:
         request: task and settings that the page sent.
         variant: variant of the projection that the model learned from.
-
     """
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
     own = generator.completion_sampling() if request.file else generator.Sampling()

@@ -24,7 +24,6 @@ class Streets(ScanDataset):
     Attributes:
         seeds: seeds of the streets.
         made_by: sensor that scans them.
-
     """
 
     licence = "none needed: made by this program"

@@ -54,7 +54,6 @@ def scan_of_columns(
         others: names of columns that were not read.
         are_named: whether the file itself has the names; where it has not, reflectance that is none shows another
             layout, and is refused.
-
     """
     named = {_plain(name): values for name, values in reversed(list(columns.items()))}
     if not {"x", "y", "z"} <= named.keys():

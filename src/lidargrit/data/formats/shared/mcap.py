@@ -99,7 +99,6 @@ def contents_by_records(file: BinaryIO, types: tuple[str, ...]) -> Contents:
     Args:
         file: recording that is open for reading.
         types: types whose messages are wanted; others that lie outside of chunks are not listed.
-
     """
     from mcap.data_stream import ReadDataStream  # noqa: PLC0415  an optional part
     from mcap.opcode import Opcode  # noqa: PLC0415

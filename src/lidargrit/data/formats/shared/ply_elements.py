@@ -53,7 +53,6 @@ def binary_rows(data: bytes, start: int, element: Element, order: str) -> tuple[
         start: position of its first row.
         element: element of the header.
         order: numpy's sign for the byte order.
-
     """
     if not element.rows:
         return {}, start

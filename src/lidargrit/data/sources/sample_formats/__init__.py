@@ -93,7 +93,6 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
         folder: folder of ``.pth`` files, with one scan or one batch of scans each.
         name: name of the sample format; recognised from the number of channels if empty.
         count: largest number of scans, evenly spaced; all if not given.
-
     """
     form = load_sample_format(name or recognise(folder))
     store = _Tensors(_paths(folder), form, count)

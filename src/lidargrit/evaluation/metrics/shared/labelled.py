@@ -49,7 +49,6 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
         seed: seed of nothing: the metric has no random numbers.
         weights: folder of a segmenter's run; if not given, the segmenter in the package that has the images' rows.
         device: device on which the segmenter computes, such as "cuda".
-
     """
 
     bounds = (0.0, 1.0)
@@ -102,7 +101,6 @@ def segmenter_of(sensor: SensorModel, named: Path | None = None) -> Path:
 
     Args:
         named: folder of a run, or of a bundle; None for the package's own.
-
     """
     folders = [locate(each, "segment") for each in (PACKAGED if named is None else [named])]
     configs = {folder: read_config(folder) for folder in folders}

@@ -124,7 +124,6 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
 
     Args:
         variant: the published definition to compute; the first of ``variants`` if not given.
-
     """
 
     def __init__(

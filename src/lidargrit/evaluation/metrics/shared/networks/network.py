@@ -32,7 +32,6 @@ class PretrainedNetwork:
 
     Args:
         name: name of the network, one of ``NETWORKS``.
-
     """
 
     def __init__(self, name: str, path: Path, device: str) -> None:
@@ -69,7 +68,6 @@ def load_network(name: str, weights: Path | None = None, device: str = "cpu") ->
 
     Args:
         name: name of the network, one of ``NETWORKS``.
-
     """
     path = find_weights(NETWORKS[name][0], weights)
     status = path.stat() if path.is_file() else None

@@ -64,7 +64,6 @@ def find_weights(published: PublishedWeights, given: Path | None = None) -> Path
     """Return the file with the weights: the given one, else one that is there already, else download it to the cache.
 
     It is looked for in ``$LIDARGRIT_WEIGHTS`` and in ``weights`` in the cache, by the name that it has at its source.
-
     """
     if given is not None:
         return given
@@ -83,7 +82,6 @@ def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Ten
     Returns:
         the tensors, float32, in memory of their own, without the counters that networks in training keep; and the
         SHA-256 of the file.
-
     """
     if not path.is_file():  # a pipe would hang
         raise _unfit(published, f"{path}, which is no file")
