@@ -8,12 +8,12 @@ import numpy as np
 
 from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, read_bytes
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
-    REFLECTANCE_RULE,
+    ColumnFormat,
+    begins_as,
     check_lines,
-    columns_of,
     plain_text,
     scan_of_columns,
     text_rows,
@@ -47,7 +47,7 @@ _TYPES = {
 _TYPE_NAMES = {kind: name for name, kind in reversed(_TYPES.items())}  # of what is written: char before int8
 
 
-class Ply(ScanFormat):
+class Ply(ColumnFormat):
     """Polygon files, of which only the vertices are read.
 
     Properties are found by their names, with or without the "scalar_" that CloudCompare puts before them: x, y, z, and
@@ -60,17 +60,11 @@ class Ply(ScanFormat):
 
     title = "PLY (polygon file)"
     suffixes = (".ply",)
-    reflectance = REFLECTANCE_RULE
-    keeps = ("reflectance", "ring", "label")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether a file begins with a header of PLY."""
-        try:
-            _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
-        except ScanError:
-            return False
-        return True
+        return begins_as(path, _HEADER_BYTES_AT_MOST, _Header.parse)
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -84,11 +78,6 @@ class Ply(ScanFormat):
                 raise
             raise _refused(first_words(error), path) from None
         return scan_of_columns(columns, path, bad_points)
-
-    @classmethod
-    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
-        return columns_of(scan)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

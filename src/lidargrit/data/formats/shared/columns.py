@@ -3,7 +3,7 @@
 import math
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from io import BytesIO
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from jaxtyping import Num
 from torch import Tensor
 
 from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.data.formats import BadPoints, damaged, scan_of
+from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, scan_of
 from lidargrit.data.formats.shared.labels import notes_on_labels
 from lidargrit.data.formats.shared.reflectance import REFLECTANCE_NAMES, choose_reflectance, floats
 from lidargrit.scans.file_rows import FileRows
@@ -34,6 +34,27 @@ _LOST_AT_MOST_M = 0.5e-3  # of coordinates, in the median: that of points beyond
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
 _RING_AT_MOST = 65_535  # 16 bits, as ROS drivers store it
 _LABEL_AT_MOST = 2**32 - 1  # SemanticKITTI's: class and instance in 16 bits each
+
+
+class ColumnFormat(ScanFormat):
+    """A format of named columns, which keeps all that a scan has of intensity, ring, label and filled points."""
+
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+
+    @classmethod
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label and filled."""
+        return columns_of(scan)
+
+
+def begins_as(path: Path, num_bytes: int, check: Callable[[bytes, Path], object]) -> bool:
+    """Return whether the first bytes of a file are the header of a format, by what checks and refuses it."""
+    try:
+        check(first_bytes(path, num_bytes), path)
+    except ScanError:
+        return False
+    return True
 
 
 def scan_of_columns(
