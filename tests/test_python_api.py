@@ -1,11 +1,15 @@
 """``import lidargrit`` as people meet it: arrays of NumPy and tensors of torch go in, whole clouds come out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import lidargrit
 from lidargrit.core.errors import DataError, ScanError
+from lidargrit.data.sources.memory import MemorySource
+from lidargrit.scans.classes import BUILDING, CLASS_BITS, ROAD
 
 SENSOR = lidargrit.load_sensor("hdl64e_kitti_odometry")
 
@@ -30,7 +34,7 @@ def test_dir_names_all_that_there_is():
 def test_points_of_any_kind_of_array_are_the_same_scan(scan, convert):
     points = scan.points_xyz_m.numpy()
     array = convert(points) if convert is torch.as_tensor else points.astype(convert)
-    found = lidargrit.scan_from_points(array)
+    found = lidargrit.Scan.from_points(array)
     assert torch.equal(found.points_xyz_m, scan.points_xyz_m)
     image = lidargrit.project(scan, SENSOR)
     assert torch.equal(lidargrit.project(array, "hdl64e_kitti_odometry").range_m, image.range_m)
@@ -41,7 +45,7 @@ def test_intensity_ring_and_label_come_in_their_usual_scales_and_orders(scan):
     elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
     from_below = np.searchsorted(np.sort(SENSOR.elevation_rad[:, 0].numpy()), elevation).clip(0, 63)
     intensity = np.arange(len(points)) % 256
-    found = lidargrit.scan_from_points(np.column_stack((points, intensity)), ring=from_below, label=[7] * len(points))
+    found = lidargrit.Scan.from_points(np.column_stack((points, intensity)), ring=from_below, label=[7] * len(points))
     assert found.reflectance is not None
     np.testing.assert_allclose(found.reflectance.numpy(), intensity / 255, atol=1e-6)
     assert found.ring is not None
@@ -88,6 +92,22 @@ def test_scans_in_memory_score_as_the_same_scans_of_a_source():
     assert images[0].shape == (2, 64, SENSOR.width)
 
 
+def test_scans_in_memory_are_scored_with_their_labels_and_reflectance():
+    streets = [lidargrit.simulate(seed=seed) for seed in range(2)]
+    no_road = [replace(one, label=torch.where(one.label & CLASS_BITS == ROAD, BUILDING, one.label)) for one in streets]
+    brighter = [replace(one, reflectance=(one.reflectance + 0.3).clamp(max=1)) for one in streets]
+    for metric, changed in (("class_jsd", no_road), ("reflectance_histogram", brighter)):
+        of_itself, of_changed = (
+            max(score.result.value for score in lidargrit.evaluate(one, streets, metrics=[metric]).scores)
+            for one in (streets, changed)
+        )
+        assert of_itself < 1e-6 < of_changed
+    image = lidargrit.project(streets[0], SENSOR)
+    read = MemorySource(streets, SENSOR).images().batch([0])
+    for plane in ("reflectance", "label"):
+        assert torch.equal(read.planes[plane][0], image.planes[plane])
+
+
 @pytest.mark.parametrize(
     ("points", "message"),
     [
@@ -107,6 +127,6 @@ def test_what_is_no_points_gets_one_line(points, message):
 
 def test_values_that_are_not_one_a_point_are_refused():
     with pytest.raises(ScanError, match=r"ring of shape \(2,\)"):
-        lidargrit.scan_from_points(np.ones((3, 3)), ring=[1, 2])
+        lidargrit.Scan.from_points(np.ones((3, 3)), ring=[1, 2])
     with pytest.raises(DataError, match="no scan in memory"):
         lidargrit.evaluate([], [np.ones((3, 3))])

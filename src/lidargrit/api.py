@@ -3,10 +3,14 @@
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 
+import numpy as np
+from torch import Tensor
+
+from lidargrit.core.errors import ScanError
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
-from lidargrit.data.formats.shared.arrays import Points, scan_from_points, scan_of
 from lidargrit.data.run_folder import PACKAGED
 from lidargrit.data.sources import Source, open_source
 from lidargrit.data.sources.memory import MemorySource
@@ -36,11 +40,13 @@ __all__ = [
     "open_model",
     "project",
     "raydrop",
-    "scan_from_points",
     "simulate",
     "unproject",
     "upsample",
 ]
+
+Points: TypeAlias = Scan | np.ndarray | Tensor
+"""A scan, or coordinates of its points in metres as an array (n, 3), or (n, 4) with intensity."""
 
 
 def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -73,7 +79,7 @@ def project(
         method, variant, partial: settings of :func:`lidargrit.scans.projection.project`.
     """
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    return project_scan(scan_of(points), sensor, method, variant, partial)
+    return project_scan(_as_scan(points), sensor, method, variant, partial)
 
 
 def complete(points: Points, model: str | Model = "pretrained", seed: int = 0) -> CompletedScan:
@@ -95,7 +101,7 @@ def complete(points: Points, model: str | Model = "pretrained", seed: int = 0) -
         whole = lidargrit.complete(points).whole()
         whole.points_xyz_m[~whole.filled]  # the measured points, bit for bit
     """
-    return complete_scan(scan_of(points), _opened(model, "pixels"), None, seed)
+    return complete_scan(_as_scan(points), _opened(model, "pixels"), None, seed)
 
 
 def upsample(
@@ -109,7 +115,7 @@ def upsample(
         model, seed: arguments of :func:`complete`; the model has the rows that are added.
     """
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    return complete_scan(scan_of(points), _opened(model, "pixels"), AddRows(sensor), seed)
+    return complete_scan(_as_scan(points), _opened(model, "pixels"), AddRows(sensor), seed)
 
 
 def raydrop(points: Points, model: str | Model = "pretrained", seed: int = 0) -> CompletedScan:
@@ -126,7 +132,7 @@ def raydrop(points: Points, model: str | Model = "pretrained", seed: int = 0) ->
 
         kept = lidargrit.raydrop(points).kept.numpy()
     """
-    return complete_scan(scan_of(points), _opened(model, "surfaces"), Drop(), seed)
+    return complete_scan(_as_scan(points), _opened(model, "surfaces"), Drop(), seed)
 
 
 def evaluate(
@@ -157,10 +163,19 @@ def evaluate(
     return compare_pair(open_pair(first, second, settings), settings)
 
 
+def _as_scan(points: Points) -> Scan:
+    if isinstance(points, Scan):
+        return points
+    if isinstance(points, (np.ndarray, Tensor)):
+        return Scan.from_points(points)
+    wanted = "a Scan, or its points as a NumPy array or torch tensor"
+    raise ScanError(f"points as {type(points).__name__}", wanted, "np.asarray(points), or lidargrit.load_scan(path)")
+
+
 def _source(scans: str | Sequence[Points], sensor: SensorModel) -> Source:
     if isinstance(scans, str):
         return open_source(scans)
-    return MemorySource([scan_of(points) for points in scans], sensor)
+    return MemorySource([_as_scan(points) for points in scans], sensor)
 
 
 def _opened(model: str | Model, kind: ConditionKind) -> Model:

@@ -11,6 +11,7 @@ EXAMPLES = """\
   lidargrit export samples tree --format kitti_odometry       sequences/00/velodyne/000000.bin, ...
   lidargrit export simulated:100 streets --format ply         with labels and rings
   lidargrit export kitti_raw:/data/kitti_raw las -n 20 --format las
+  lidargrit export drive.mcap still --format pcd --undo-motion poses.txt     as if the car had stood still
 """
 
 
@@ -32,6 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     sensor = "name or .json file of the sensor, for range images in .npy files"
     parser.add_argument("--sensor", default="", help=sensor)
+    poses = "poses of the lidar, to undo its motion: a file of time x y z qx qy qz qw, or KITTI's folder of a sequence"
+    parser.add_argument("--undo-motion", type=Path, metavar="POSES", help=poses)
     add_bad_scans(parser)
 
 
@@ -39,9 +42,12 @@ def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many."""
     from lidargrit.data.export import export_scans
     from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.data.trajectories import read_trajectory
+    from lidargrit.scans.motion import UndoMotion
     from lidargrit.scans.sensors import load_sensor
 
     sensor = load_sensor(options.sensor) if options.sensor else None
     config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = export_scans(options.source, options.out, options.format, config, sensor)
+    change = UndoMotion(read_trajectory(options.undo_motion)) if options.undo_motion else None
+    count = export_scans(options.source, options.out, options.format, config, sensor, change)
     print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

@@ -12,6 +12,7 @@ from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, writable_for
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
+from lidargrit.scans.motion import UndoMotion
 from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
@@ -25,7 +26,7 @@ def export_scans(
     kind: str,
     config: DataConfig | None = None,
     sensor: SensorModel | None = None,
-    change: Rescan | None = None,
+    change: Rescan | UndoMotion | None = None,
 ) -> int:
     """Write every scan of a source to a file of its own; files that are there already are not written again.
 
@@ -40,7 +41,7 @@ def export_scans(
             ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
-        change: view of another sensor, as which each scan is written; scans stay as they are if not given.
+        change: work on each scan before it is written; scans stay as they are if not given.
 
     Returns:
         Number of scans that are there now.
@@ -48,7 +49,7 @@ def export_scans(
     config = config or DataConfig()
     layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
     scans, of_images = _open(source, config, sensor)
-    read = scans.scan if change is None else _View(scans, change)
+    read = scans.scan if change is None else _Changed(scans, change)
     scans.check_output(out)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     facts = {"source": source, "format": kind, **of_images, **(change.identity() if change else {})}
@@ -66,21 +67,19 @@ def export_scans(
     return folder.num_written
 
 
-class _View:
-    """Scans as another sensor sees them; of the first one it tells how many rays get a point."""
+class _Changed:
+    """Scans after some work, of which the first is told about."""
 
-    def __init__(self, scans: NamedScans, change: Rescan) -> None:
+    def __init__(self, scans: NamedScans, change: Rescan | UndoMotion) -> None:
         self._scans, self._change, self._told = scans, change, False
 
     def __call__(self, index: int) -> Scan:
-        """Return one scan as the other sensor sees it."""
-        seen = self._change(self._scans.scan(index))
+        """Return one scan after the work."""
+        changed = self._change(self._scans.timed(index))
         if not self._told:
-            look = f"; {seen.without_rows:,} look where the scans have no rows" if seen.without_rows else ""
-            points = f"{len(seen.scan):,} of {seen.rays:,} rays get a point of the first scan{look}"
-            reporting.message(f"{self._change.other.name}: {points}")
+            reporting.message(f"{printable(changed.scan.source)}: {changed.told}")
             self._told = True
-        return seen.scan
+        return changed.scan
 
 
 def _told_notes(of: str, notes: Sequence[str], told: set[str]) -> set[str]:

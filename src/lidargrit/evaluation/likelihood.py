@@ -20,8 +20,8 @@ from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
+from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.projection.image import told_share
-from lidargrit.scans.types import ScanBits
 
 _BATCH = 4
 _COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes

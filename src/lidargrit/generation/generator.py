@@ -21,9 +21,10 @@ from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.saved import ConfigT, SavedModel, download, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
+from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing, Observed
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage, ScanBits
+from lidargrit.scans.types import RangeImage
 
 SamplingT = TypeVar("SamplingT")
 

@@ -23,11 +23,12 @@ from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
+from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.fills import fill_from_nearest
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage, ScanBits, TokenGrid
+from lidargrit.scans.types import RangeImage, TokenGrid
 
 _DECODED_AT_ONCE = 4  # scans; enough to keep a GPU busy, and more would only take memory: 35 MB a layer at 64x1024
 

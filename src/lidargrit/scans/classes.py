@@ -14,7 +14,8 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, one_of
-from lidargrit.scans.types import CLASS_BITS
+
+CLASS_BITS: Final = 0xFFFF  # of a label: its class; the bits above number the instance
 
 Colour = tuple[int, int, int]
 Group = Literal["", "road", "sidewalk", "terrain", "building", "vegetation", "vehicle", "person, cycle", "pole, sign"]
@@ -172,6 +173,15 @@ def unknown_numbers(label: Int[Tensor, "*B"], numbering: str = "semantic_kitti")
 def listed(numbers: Sequence[int]) -> str:
     """Return numbers in words, the first eight of many."""
     return ", ".join(map(str, numbers[:_NAMED_AT_MOST])) + (", ..." if len(numbers) > _NAMED_AT_MOST else "")
+
+
+def notes_on_labels(label: Int[Tensor, "n"] | None) -> tuple[str, ...]:
+    """Return a note if some classes are none of SemanticKITTI's, so that the others are most likely none either."""
+    if label is None or not (unknown := unknown_numbers(label)):
+        return ()
+    low, high = (int(number) for number in (label.long() & CLASS_BITS).aminmax())
+    what = f"labels from {low} to {high} are not SemanticKITTI's, which has no {listed(unknown)}"
+    return (f"{what}; map them to its numbers (learning_map_inv, if its learning_map made them)",)
 
 
 def as_semantic_kitti(label: Int[Tensor, "*B"], numbering: str) -> Int[Tensor, "*B"]:

@@ -1,6 +1,6 @@
 """A cloud as another sensor would see it: its own points, on whose rays the other sensor looks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +29,12 @@ class Rescanned(NamedTuple):
     scan: Scan
     rays: int
     without_rows: int
+
+    @property
+    def told(self) -> str:
+        """How many rays have a point, in words."""
+        look = f"; {self.without_rows:,} look where the scans have no rows" if self.without_rows else ""
+        return f"{len(self.scan):,} of {self.rays:,} rays get a point of the first scan{look}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +82,8 @@ class Rescan:
         if not len(points):
             got = f"{scan.source}, of which the sensor {self.other.name!r} sees no point"
             raise ScanError(got, "clouds whose rays it shares", "check --sensor, or choose another --to")
-        at = torch.from_numpy(points)
-        reflectance, label = (None if part is None else part[at] for part in (scan.reflectance, scan.label))
-        ring = torch.from_numpy(rows.astype(np.int64))
-        seen = Scan(points_xyz_m[at], reflectance, ring, label, scan.source, scan.full_scale, scan.notes)
+        moved = replace(scan, points_xyz_m=points_xyz_m, rows=None)
+        seen = replace(moved.select(torch.from_numpy(points)), ring=torch.from_numpy(rows.astype(np.int64)))
         return Rescanned(seen, len(rays), int((~known).sum()))
 
     def _spaced(self, xyz: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 2"]:

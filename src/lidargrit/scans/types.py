@@ -5,17 +5,25 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.scans.columns import (
+    BadPoints,
+    ScanParts,
+    Values,
+    columns_of_arrays,
+    parts_of_columns,
+    selected,
+)
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.planes import NO_PLANES, checked_planes, common_planes, masked_planes, planes_of
 from lidargrit.scans.sensors import SensorModel
 
 TYPICAL_LOG_RANGE = 2.5  # ln(1 + range in metres) in the middle of what scans hold: subtracted, inputs are near 0
-CLASS_BITS = 0xFFFF  # of a label: its class; the bits above number the instance
 
 MaskDecoding = Literal["bernoulli", "threshold"]
 """How returns are decided from their probabilities: each at random, or wherever a return is likelier than none."""
@@ -34,6 +42,8 @@ class Scan:
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
             largest value decided; 0 elsewhere.
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
+        point_time_s: time of every point in seconds, kept in 64 bits: on the clock of ``time_s``, or since the scan
+            began; None if it is not known.
         filled: True for points that a model added to the measured ones; None where none did.
         rows: rows of the file that the points were read from; None where the format keeps none.
         time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
@@ -54,6 +64,41 @@ class Scan:
     rows: FileRows | None = None
     time_s: float | None = None
     pose: Float64[Tensor, "4 4"] | None = None
+    point_time_s: Float[Tensor, "n"] | None = None
+
+    @classmethod
+    def from_points(
+        cls,
+        xyz: np.ndarray | Tensor,
+        intensity: Values | None = None,
+        ring: Values | None = None,
+        time: Values | None = None,
+        label: Values | None = None,
+        bad_points: BadPoints = "refuse",
+    ) -> "Scan":
+        """Make a scan of arrays, of NumPy or torch on any device.
+
+        Args:
+            xyz: coordinates (n, 3) in metres in the sensor's frame, x forward, y left, z up; with intensity (n, 4).
+            intensity: intensity or reflectance (n,), from 0 to 1, 255 or 65,535: the smallest that no value exceeds.
+            ring: index of each point's laser (n,), counted from the top or from the bottom.
+            time: time of each point (n,), in seconds, or in nanoseconds as whole numbers.
+            label: class of each point (n,) by SemanticKITTI's numbers.
+            bad_points: treatment of points that are no returns: ``refuse`` raises an error, ``drop`` removes points
+                with NaN or infinite coordinates and points at the origin.
+
+        Raises:
+            ScanError: an array of another shape, or points that cannot be used; says what is wrong and what to do.
+
+        Example:
+            >>> import numpy as np
+            >>> scan = Scan.from_points(np.array([[10.0, 0.0, -1.0], [0.0, 5.0, -1.0]]), intensity=[12, 255])
+            >>> len(scan), round(float(scan.reflectance[0]), 3)
+            (2, 0.047)
+        """
+        columns = columns_of_arrays(xyz, intensity=intensity, ring=ring, time=time, label=label)
+        source = "the points in memory"
+        return cls(**parts_of_columns(columns, source, bad_points), source=source)
 
     def __post_init__(self) -> None:
         if len(self) == 0:
@@ -61,7 +106,7 @@ class Scan:
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
-        for name in ("reflectance", "ring", "label", "filled"):
+        for name in ("reflectance", "ring", "label", "filled", "point_time_s"):
             values: Tensor | None = getattr(self, name)
             if values is not None and values.shape != (len(self),):
                 raise ScanError(
@@ -69,6 +114,8 @@ class Scan:
                     f"one for each of {len(self)} points",
                     "fix it",
                 )
+        if self.point_time_s is not None:
+            object.__setattr__(self, "point_time_s", self.point_time_s.double())
         # Point by point takes twenty times as long as over all coordinates at once, and is seldom needed.
         low, high = self.points_xyz_m.aminmax()  # NaN where any is: no comparison holds
         if not (bool(low > -torch.inf) and bool(high < torch.inf)):
@@ -105,10 +152,20 @@ class Scan:
         """Return the scan without the points that a model added."""
         if self.filled is None or bool(self.filled.all()):
             return self
-        kept = ~self.filled
-        parts = (self.reflectance, self.ring, self.label)
-        reflectance, ring, label = (None if each is None else each[kept] for each in parts)
-        return Scan(self.points_xyz_m[kept], reflectance, ring, label, self.source, self.full_scale, self.notes)
+        return replace(self.select(~self.filled), filled=None)
+
+    def select(self, which: Bool[Tensor, "n"] | Int[Tensor, "k"]) -> "Scan":
+        """Return some of the points with all that is known of them, by a mask or by their numbers."""
+        parts = ScanParts(
+            points_xyz_m=self.points_xyz_m,
+            reflectance=self.reflectance,
+            ring=self.ring,
+            label=self.label,
+            filled=self.filled,
+            point_time_s=self.point_time_s,
+            rows=self.rows,
+        )
+        return replace(self, **selected(parts, which))
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,78 +354,6 @@ class Decoded:
 
     def _masked(self, return_mask: Bool[Tensor, "B H W"]) -> RangeImage:
         return RangeImage.masked(self.range_m, return_mask, self.sensor, planes_of(reflectance=self.reflectance))
-
-
-@dataclass(frozen=True, eq=False)
-class ScanBits:
-    """Negative log-likelihood of each scan of a batch in bits, by parts.
-
-    Args:
-        step_mm: step in millimetres that ranges are rounded to.
-        return_mask: returns of the scans.
-        tokens: bits of each token, given those before it.
-        mask: bits of the return or ray drop of each pixel, given the tokens; None from a model that has no such
-            probability.
-        range: bits of the range of each pixel, given tokens and mask, 0 where there is no return; None from a model
-            that has no such probability.
-        expected: expected bits of mask and range of each pixel (the entropy), given all that comes before it; None if
-            not asked for.
-    """
-
-    step_mm: int
-    return_mask: Bool[Tensor, "B H W"]
-    tokens: Float[Tensor, "B h w"]
-    mask: Float[Tensor, "B H W"] | None = None
-    range: Float[Tensor, "B H W"] | None = None
-    expected: Float[Tensor, "B H W"] | None = None
-
-    @classmethod
-    def cat(cls, batches: "Sequence[ScanBits]") -> "ScanBits":
-        """Make one batch of several batches of one model, by one step."""
-        first = batches[0]
-        parts = {
-            name: torch.cat([getattr(batch, name) for batch in batches])
-            for name in ("return_mask", "tokens", "mask", "range", "expected")
-            if getattr(first, name) is not None
-        }
-        return replace(first, **parts)
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the bits name the whole scan; tokens alone leave open what is lost in encoding."""
-        return self.mask is not None and self.range is not None
-
-    def per_scan(self) -> dict[str, Float[Tensor, "B"]]:
-        """Return the bits of each part of each scan, by the part's name, in 64 bits."""
-        parts = {"tokens": self.tokens, "mask": self.mask, "range": self.range}
-        return {name: bits.double().sum((1, 2)) for name, bits in parts.items() if bits is not None}
-
-    def total(self) -> Float[Tensor, "B"]:
-        """Return the bits of each scan, all parts together, in 64 bits."""
-        return torch.stack([*self.per_scan().values()]).sum(0)
-
-    def per_pixel(self) -> Float[Tensor, "B H W"]:
-        """Return the bits of each pixel: of its mask, its range, and an even share of its token's."""
-        height, width = self.return_mask.shape[1:]
-        rows, columns = height // self.tokens.shape[1], width // self.tokens.shape[2]
-        bits = self.tokens.repeat_interleave(rows, 1).repeat_interleave(columns, 2) / (rows * columns)
-        for part in (self.mask, self.range):
-            bits = bits if part is None else bits + part
-        return bits
-
-    def surprise(self) -> Float[Tensor, "B H W"]:
-        """Return by how many bits each pixel's mask and range exceed their expected bits; 0 on average for usual scans.
-
-        Raises:
-            ConfigError: the expected bits were not asked for, or the model does not tell them.
-        """
-        if self.mask is None or self.range is None or self.expected is None:
-            raise ConfigError(
-                "bits without those that were expected",
-                "both, from a model with a pixel decoder",
-                "ask for them: model.bits(images, expected=True)",
-            )
-        return self.mask + self.range - self.expected
 
 
 @dataclass(frozen=True)

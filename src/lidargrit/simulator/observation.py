@@ -59,6 +59,7 @@ class Observation:
         cos_incidence: cosine between ray and surface normal; 0 where the ray meets nothing.
         directions: unit vectors of the rays in the sensor's frame when each was fired.
         sensor_pose: transform from the sensor's frame to the scene's at the beginning of the revolution.
+        fired_s: time of each ray since then, in seconds; None where the sensor stands still meanwhile.
     """
 
     clean_range_m: Float32[np.ndarray, "H W"]
@@ -72,6 +73,7 @@ class Observation:
     cos_incidence: Float32[np.ndarray, "H W"]
     directions: Float32[np.ndarray, "H W 3"]
     sensor_pose: Float64[np.ndarray, "4 4"]
+    fired_s: Float32[np.ndarray, "H W"] | None = None
 
     def scan(self, source: str) -> Scan:
         """Return the points that came back in the firing order of KITTI's files."""
@@ -91,6 +93,7 @@ class Observation:
             torch.from_numpy(ring),
             torch.from_numpy(label),
             source=source,
+            point_time_s=None if self.fired_s is None else torch.from_numpy(self.fired_s.ravel()[at]),
         )
 
     def surfaces(self, source: str, limits_m: tuple[float, float]) -> Scan:
@@ -167,7 +170,9 @@ def observe_scene(
     echoes = detect_echoes(tracer, surfaces, rays, first, edge, model)
     limits_m = sensor.range_min_m, sensor.range_max_m
     lasers = Lasers.of(sensor, model)
-    return _measure(mesh, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
+    seen = _measure(mesh, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
+    fired_s = np.broadcast_to(looked.turn * np.float32(REVOLUTION_S), seen.range_m.shape)
+    return replace(seen, fired_s=fired_s) if config.motion else seen
 
 
 def _beside(

@@ -205,7 +205,12 @@ class Window:
 
     def scans(self) -> list[Scan]:
         """Read the scans, each with its time, and its pose where that is known."""
-        return [replace(self.dataset.scan(at), **self.dataset.motion(at)._asdict()) for at in self.indices]
+        return [self._scan(at) for at in self.indices]
+
+    def _scan(self, index: int) -> Scan:
+        scan, motion = self.dataset.scan(index), self.dataset.motion(index)
+        time_s = scan.time_s if motion.time_s is None else motion.time_s  # messages of ROS have one of their own
+        return replace(scan, time_s=time_s, pose=motion.pose)
 
 
 def open_dataset(source: str, bad_points: BadPoints = "refuse") -> ScanDataset:

@@ -6,14 +6,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from io import BufferedReader
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import OutputError, ScanError, first_words
+from lidargrit.scans.columns import BadPoints, ScanParts, usable_parts
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.types import Scan
 
@@ -31,7 +32,6 @@ _CURES = {  # by the ending, for files that hold scans but are not read
     (".bag.active",): "finish it with: rosbag reindex",
     (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
 }
-BadPoints = Literal["refuse", "drop"]
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
 
 
@@ -216,26 +216,20 @@ def scan_of(
     ring: Int[Tensor, "n"] | None,
     source: str,
     bad_points: BadPoints,
-    label: Int[Tensor, "n"] | None = None,
-    full_scale: int = 0,
-    notes: tuple[str, ...] = (),
     filled: Bool[Tensor, "n"] | None = None,
     rows: FileRows | None = None,
+    point_time_s: Float64[Tensor, "n"] | None = None,
 ) -> Scan:
     """Make a scan of what a file holds, without points that are no returns if ``bad_points`` is ``drop``."""
-    if bad_points == "drop":
-        kept = usable_points(points_xyz_m, reflectance)
-        points_xyz_m = points_xyz_m[kept]
-        reflectance, ring, label = (None if one is None else one[kept] for one in (reflectance, ring, label))
-        filled = None if filled is None else filled[kept]
-        rows = None if rows is None else FileRows(rows.columns, rows.of_point[kept.numpy()])
-    return Scan(points_xyz_m.contiguous(), reflectance, ring, label, source, full_scale, notes, filled, rows)
-
-
-def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
-    """Return which points are returns: finite, away from the origin, and with a reflectance if any has one."""
-    usable = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
-    return usable if reflectance is None else usable & ~reflectance.isnan()
+    parts = ScanParts(
+        points_xyz_m=points_xyz_m.contiguous(),
+        reflectance=reflectance,
+        ring=ring,
+        filled=filled,
+        rows=rows,
+        point_time_s=point_time_s,
+    )
+    return Scan(**(usable_parts(parts) if bad_points == "drop" else parts), source=source)
 
 
 def open_file(path: Path, wanted: str) -> BufferedReader:

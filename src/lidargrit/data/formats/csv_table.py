@@ -15,10 +15,10 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
     check_lines,
-    known_name,
     plain_text,
     scan_of_columns,
 )
+from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "lines of numbers below a line that names the columns, x, y and z among them"

@@ -18,9 +18,10 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
     begins_as,
-    known_name,
+    columns_of,
     scan_of_columns,
 )
+from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an uncompressed LAS file of version 1.0 to 1.4"
@@ -30,6 +31,7 @@ _HEADER_BYTES_14 = 375
 _COMPRESSED = 0xC0  # bits of the point format that LAZ sets
 _POINT_FORMATS = 11  # 0 to 10
 _RECORDS_AT_MOST = 1000  # of remarks between header and points; real files have 1 to 10
+_TIME = "gps_time"  # in seconds
 _STEP_M = 1e-4  # in which coordinates are kept: a twentieth of a sensor's own step, and 214 km in 32 bits
 _OURS = "lidargrit"  # the program that writes a file
 _INTENSITY_STEPS = 65_535  # 16 bits, as the standard wants them
@@ -41,8 +43,8 @@ class Las(ColumnFormat):
 
     Reflectance is LAS's intensity, and none where all of it is 0, which is how LAS says so. Files that this program
     writes have it from 0 to 1, too, in an extra dimension of that name, as they have ring and label; the classes of LAS
-    are others than SemanticKITTI's and left alone. Files are written as version 1.4, point format 0, with coordinates
-    in steps of 0.1 mm.
+    are others than SemanticKITTI's and left alone. Files are written as version 1.4, point format 0 or, where points
+    have times, 1, with coordinates in steps of 0.1 mm.
 
     Source:
         LAS Specification 1.4 R15, American Society for Photogrammetry and Remote Sensing, 2019.
@@ -77,6 +79,12 @@ class Las(ColumnFormat):
         return scan_of_columns(columns, path, bad_points)
 
     @classmethod
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label, filled and gps_time."""
+        columns = columns_of(scan)
+        return {_TIME if name == "time" else name: values for name, values in columns.items()}
+
+    @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new file."""
         try:
@@ -87,7 +95,7 @@ class Las(ColumnFormat):
         farthest_m = float(np.abs(xyz_m).max())
         if farthest_m >= _STEP_M * np.iinfo(np.int32).max:
             raise OutputError(f"a coordinate of {farthest_m:g} m", "at most 214 km", "choose .ply")
-        header = laspy.LasHeader(version="1.4", point_format=0)
+        header = laspy.LasHeader(version="1.4", point_format=1 if _TIME in columns else 0)
         header.scales, header.offsets = np.full(3, _STEP_M), np.zeros(3)
         header.generating_software, header.creation_date = _OURS, _WRITTEN_ON
         extra = {name: columns[name] for name in ("ring", "label", "filled") if name in columns}
@@ -98,6 +106,8 @@ class Las(ColumnFormat):
         cloud.xyz = xyz_m
         if "intensity" in columns:
             cloud.intensity = _steps(columns["intensity"])
+        if _TIME in columns:
+            cloud[_TIME] = columns[_TIME].astype(np.float64)
         for name, values in extra.items():
             cloud[name] = values
         with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -109,7 +119,7 @@ def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
     intensity = np.asarray(points["intensity"])
     if intensity.any():
         columns["intensity"] = intensity
-    for name in points.point_format.extra_dimension_names:
+    for name in (*points.point_format.extra_dimension_names, *{_TIME} & {*points.point_format.dimension_names}):
         values = np.asarray(points[name])
         if known_name(name) and values.ndim == 1:
             columns[name] = values

@@ -15,10 +15,10 @@ from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, damaged, first_byt
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
-    known_name,
     scan_of_columns,
 )
 from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
+from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers or of named ones, or an .npz with an array points of n rows"

@@ -71,7 +71,8 @@ class OusterPcap(ScanFormat):
         ring = torch.from_numpy(row_to_ring[np.nonzero(returned)[0]])
         with np.errstate(over="ignore"):  # infinite, and so refused or dropped
             points_xyz_m = torch.from_numpy(xyz_m.astype(np.float32))
-        return scan_of(points_xyz_m, reflectance, ring, f"{path}#{index}", bad_points)
+        fired_s = torch.from_numpy(frame.timestamp[np.nonzero(returned)[1]].astype(np.float64) / 1e9)
+        return scan_of(points_xyz_m, reflectance, ring, f"{path}#{index}", bad_points, point_time_s=fired_s)
 
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:

@@ -78,13 +78,16 @@ class RosBag(ScanFormat):
             what = f"scan number {index} of {path}"
             raise ScanError(what, f"one of its {len(recording.times)}, counted from 0", "take another")
         try:
-            columns, notes = columns_of_cloud(recording.message(index))
+            cloud = recording.message(index)
+            columns, notes = columns_of_cloud(cloud)
         except ScanError:
             raise
         except Exception as error:  # the libraries meet damaged bytes with whatever they stumble over
             raise damaged(path, _FORMAT, error) from None
         scan = scan_of_columns(columns, path.with_name(f"{path.name}#{index}"), bad_points)
-        return replace(scan, notes=(*recording.notes, *notes, *scan.notes))
+        stamp = cloud.header.stamp
+        time_s = float(stamp.sec) + float(stamp.nanosec) / 1e9
+        return replace(scan, notes=(*recording.notes, *notes, *scan.notes), time_s=time_s or None)
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ from lidargrit.core.errors import DataError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.source import Source
-from lidargrit.scans.projection import project, projection_that_fits
+from lidargrit.scans.projection import project_by_what_fits
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
@@ -40,11 +40,8 @@ class MemorySource(Source):
         """Project the scans, or so many of them, evenly spaced."""
         sensor, config = sensor or self.sensor, config or DataConfig()
         chosen = evenly_spaced(config.max_scans or len(self._scans), len(self._scans))
-        images = []
-        for scan in (self._scans[index] for index in chosen):
-            method = projection_that_fits(scan, sensor)
-            variant = config.projection_variant if method == sensor.projection else "exact"
-            images.append(project(scan, sensor, method, variant))
+        by = config.projection_variant
+        images = [project_by_what_fits(self._scans[index], sensor, by)[0] for index in chosen]
         return RangeImages(sensor, [_Images(images)])
 
 
@@ -60,5 +57,6 @@ class _Images:
         return len(self._images)
 
     def read(self, index: int) -> Pixels:
-        """Return the ranges of one image."""
-        return Pixels(self._images[index].range_m.numpy())
+        """Return the pixels of one image."""
+        image = self._images[index]
+        return Pixels(image.range_m.numpy(), {name: pixels.numpy() for name, pixels in image.planes.items()})

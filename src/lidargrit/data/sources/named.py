@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import OutputError
-from lidargrit.data.datasets import ScanDataset
+from lidargrit.data.datasets import ScanDataset, Window
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import DatasetSource
@@ -42,6 +42,10 @@ class NamedScans(ABC):
     @abstractmethod
     def scan(self, index: int) -> Scan:
         """Return the points of a scan; those of a range image lie on the rays of its pixels."""
+
+    def timed(self, index: int) -> Scan:
+        """Return the points of a scan with its time and pose, where files beside it tell them."""
+        return self.scan(index)
 
     def path(self, index: int) -> Path | None:
         """Return the file that holds the points of a scan; None where there is none."""
@@ -81,6 +85,11 @@ class PointScans(NamedScans):
     def scan(self, index: int) -> Scan:
         """Read its points."""
         return self._dataset.scan(self._indices[index])
+
+    def timed(self, index: int) -> Scan:
+        """Read its points, time and pose."""
+        (scan,) = Window(self._dataset, (self._indices[index],)).scans()
+        return scan
 
     def path(self, index: int) -> Path | None:
         """Return its file."""

@@ -33,23 +33,23 @@ class CompletedScan:
     def whole(self) -> Scan:
         """Return the points that stay, in their order and bit for bit, then those that were added.
 
-        Reflectance, ring and label are there where the scan has them; ``filled`` marks what was added.
+        Reflectance, ring and label are there where the scan has them; ``filled`` marks what was added, whose times are
+        those of the points nearest to its rays.
         """
-        own, added = self.scan, self.filled
-        parts = [own.points_xyz_m, own.reflectance, own.ring, own.label]
-        parts = [None if part is None else part[self.kept] for part in parts]
-        marks = torch.zeros(int(self.kept.sum()), dtype=torch.bool) if own.filled is None else own.filled[self.kept]
-        if added is not None:
-            new = [added.points_xyz_m, added.reflectance, added.ring, added.label]
-            parts = [
-                None if one is None or other is None else torch.cat((one, other.to(one)))
-                for one, other in zip(parts, new, strict=True)
-            ]
-            marks = torch.cat((marks, torch.ones(len(added), dtype=torch.bool)))
-        points_xyz_m, reflectance, ring, label = parts
-        assert points_xyz_m is not None
-        told = None if added is None and own.filled is None else marks
-        return Scan(points_xyz_m, reflectance, ring, label, own.source, own.full_scale, own.notes, told)
+        own, added = replace(self.scan.select(self.kept), rows=None), self.filled
+        if added is None:
+            return own
+        marks = torch.zeros(len(own), dtype=torch.bool) if own.filled is None else own.filled
+        fired_s = None if self.scan.point_time_s is None else self.scan.point_time_s[self.nearest_kept()]
+        return replace(
+            own,
+            points_xyz_m=torch.cat((own.points_xyz_m, added.points_xyz_m)),
+            reflectance=_joined(own.reflectance, added.reflectance),
+            ring=_joined(own.ring, added.ring),
+            label=_joined(own.label, added.label),
+            filled=torch.cat((marks, torch.ones(len(added), dtype=torch.bool))),
+            point_time_s=_joined(own.point_time_s, fired_s),
+        )
 
     def nearest_kept(self) -> Int64[np.ndarray, "m"]:
         """Return for each added point which point of the scan that stays lies nearest to its ray."""
@@ -155,6 +155,10 @@ def _rings_of_added(seen: InputScan, added: Scan) -> Int[Tensor, "m"] | None:
     order = np.argsort(of_laser)
     borders = (of_laser[order][1:] + of_laser[order][:-1]) / 2
     return torch.from_numpy(numbers[order][np.searchsorted(borders, _elevations(added.points_xyz_m))])
+
+
+def _joined(own: Tensor | None, added: Tensor | None) -> Tensor | None:
+    return None if own is None or added is None else torch.cat((own, added.to(own)))
 
 
 def _elevations(points_xyz_m: Tensor) -> Float64[np.ndarray, "n"]:

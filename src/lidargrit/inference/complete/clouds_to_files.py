@@ -8,9 +8,9 @@ from torch import Tensor
 
 from lidargrit.data import formats
 from lidargrit.data.formats import ScanFormat
-from lidargrit.data.formats.shared.columns import quantity_of
 from lidargrit.data.scan_folder import IMAGE, TREE, writable_format, write_with_labels
 from lidargrit.inference.complete.cloud import CompletedScan
+from lidargrit.scans.columns import quantity_of
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.types import Scan
 
@@ -57,7 +57,10 @@ def write_cloud(path: Path, kind: str, done: CompletedScan, form: type[ScanForma
     elif wanted is form and done.scan.rows is not None:
         wanted.write_columns(path, _rows_of_file(done, done.scan.rows, wanted))
     else:
-        wanted.write_columns(path, {**_more_columns(done), **wanted.columns_of(whole)})
+        more, columns = _more_columns(done), wanted.columns_of(whole)
+        if any(quantity_of(name) == "time" for name in more):  # in the file's own name and type
+            columns.pop("time", None)
+        wanted.write_columns(path, {**more, **columns})
     return whole.label is None or "label" in wanted.keeps
 
 
@@ -81,14 +84,14 @@ def _rows_of_file(done: CompletedScan, rows: FileRows, form: type[ScanFormat]) -
 
 
 def _more_columns(done: CompletedScan) -> dict[str, np.ndarray]:
-    """Return the columns of a scan's file that a scan has no room for, such as the time of each point."""
+    """Return the times of each point as the scan's file has them, and columns that a scan has no room for."""
     rows = done.scan.rows
     if rows is None:
         return {}
     of_point = rows.of_point[done.kept.numpy()]
     if done.filled is not None:
         of_point = np.concatenate((of_point, rows.of_point[done.nearest_kept()]))
-    return {name: values[of_point] for name, values in rows.columns.items() if not quantity_of(name)}
+    return {name: values[of_point] for name, values in rows.columns.items() if quantity_of(name) in ("", "time")}
 
 
 def _as_in_file(

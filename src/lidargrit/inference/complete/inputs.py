@@ -1,6 +1,5 @@
 """A user's scans → range images on the grid of a sensor, and the points that lie in their pixels."""
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,11 +19,11 @@ from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.grid import RayGrid
-from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project, unproject
+from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project_by_what_fits, unproject
 from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
-from lidargrit.scans.projection.sensor_check import has_few_rings, projection_that_fits, ring_count, told_doubt
-from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count, told_doubt
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 
 
@@ -170,21 +169,7 @@ class ScanReader:
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
                 self.few_rings_cure,
             )
-        method = projection_that_fits(scan, self.sensor)
-        try:
-            return self._read(scan, method)
-        except ScanError:
-            # Points without a ring that are in firing order, and too few, are a file that was cut off.
-            if method == "spherical" or (scan.ring is None and not self.partial):
-                raise
-            with contextlib.suppress(ScanError):
-                return self._read(scan, "spherical")
-            raise
-
-    def _read(self, scan: Scan, method: ProjectionName) -> InputScan:
-        # The reference variant of a projection by elevation knows no sensor.
-        variant = self.variant if method == self.sensor.projection else "exact"
-        image = project(scan, self.sensor, method, variant, self.partial)
+        image, method, variant = project_by_what_fits(scan, self.sensor, self.variant, self.partial)
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         doubt = doubts_about_rays(scan, self.sensor, method)
         said = told_doubt(scan.source, self.sensor, doubt)

@@ -17,8 +17,8 @@ from lidargrit.inference.complete.inputs import ScanReader
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.inference.segment.points import labels_of_points
 from lidargrit.inference.segment.scores import LabelScores
-from lidargrit.scans.classes import as_semantic_kitti
-from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
+from lidargrit.scans.classes import CLASS_BITS, as_semantic_kitti
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
 
 MANIFEST = "segmented.json"

@@ -1,14 +1,17 @@
 """Scan → range image, by spherical projection or by scan unfolding."""
 
+import contextlib
+
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32
 
 from lidargrit.core.errors import ScanError
+from lidargrit.scans.classes import CLASS_BITS
 from lidargrit.scans.projection.pixel_coordinates import ProjectionVariant, pixel_coordinates, within_limits
-from lidargrit.scans.projection.sensor_check import fit_problems
+from lidargrit.scans.projection.sensor_check import fit_problems, projection_that_fits
 from lidargrit.scans.sensors import ProjectionName, SensorModel
-from lidargrit.scans.types import CLASS_BITS, RangeImage, Scan
+from lidargrit.scans.types import RangeImage, Scan
 
 
 def project(
@@ -68,6 +71,36 @@ def project(
         of_point = np.append(scan.label.long().numpy() & CLASS_BITS, 0)  # 8 bits do not hold that mask
         planes["label"] = torch.from_numpy(of_point.take(point_of_pixel))
     return RangeImage(torch.from_numpy(range_m), torch.from_numpy(filled), sensor, planes)
+
+
+def project_by_what_fits(
+    scan: Scan, sensor: SensorModel, variant: ProjectionVariant = "exact", partial: bool = False
+) -> tuple[RangeImage, ProjectionName, ProjectionVariant]:
+    """Return a scan's range image by the sensor's projection, or by elevation where rings or firing order do not fit.
+
+    Args:
+        scan, sensor, variant, partial: arguments of :func:`project`; the variant is that of the sensor's projection.
+
+    Returns:
+        the image, and the method and variant by which it was made.
+    """
+    method = projection_that_fits(scan, sensor)
+    try:
+        return _by_method(scan, sensor, method, variant, partial)
+    except ScanError:
+        if method == "spherical" or (scan.ring is None and not partial):
+            raise
+        with contextlib.suppress(ScanError):
+            return _by_method(scan, sensor, "spherical", variant, partial)
+        raise
+
+
+def _by_method(
+    scan: Scan, sensor: SensorModel, method: ProjectionName, variant: ProjectionVariant, partial: bool
+) -> tuple[RangeImage, ProjectionName, ProjectionVariant]:
+    # The reference variant of a projection by elevation knows no sensor.
+    variant = variant if method == sensor.projection else "exact"
+    return project(scan, sensor, method, variant, partial), method, variant
 
 
 def told_share(image: RangeImage, num_points: int) -> str:

@@ -11,9 +11,10 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokens import PixelObjective
 from lidargrit.nn.random import rngs_of
+from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage, ScanBits
+from lidargrit.scans.types import RangeImage
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     Source:
         Geiger et al., CVPR 2012, readme.txt of the odometry benchmark's development kit.
     """
-    times_s = _table(sequence / "times.txt", 1, "one finite number of seconds in each row")[:, 0]
+    times_s = table(sequence / "times.txt", 1, "one finite number of seconds in each row")[:, 0]
     if bool((np.diff(times_s) <= 0).any()):
         raise DataError(f"times that do not rise in {sequence / 'times.txt'}", "rising seconds", "restore the file")
-    cameras = _table(sequence / "poses.txt", 12, _POSE).reshape(-1, 3, 4)
+    cameras = table(sequence / "poses.txt", 12, _POSE).reshape(-1, 3, 4)
     poses = _homogeneous(cameras)
     if len(poses):
         camera_from_sensor = _camera_from_sensor(sequence / "calib.txt")
@@ -57,8 +57,10 @@ def _homogeneous(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 
     return np.concatenate((poses, last), 1)
 
 
-def _table(path: Path, columns: int, wanted: str) -> Float64[np.ndarray, "n columns"]:
-    return _numbers([line for line in _lines(path) if line.strip()], columns, path, wanted)
+def table(path: Path, columns: int, wanted: str) -> Float64[np.ndarray, "n columns"]:
+    """Return the rows of a file of numbers between blanks, without comments; none where there is no such file."""
+    rows = [line for line in _lines(path) if line.strip() and not line.lstrip().startswith("#")]
+    return _numbers(rows, columns, path, wanted)
 
 
 def _numbers(rows: list[str], columns: int, path: Path, wanted: str) -> Float64[np.ndarray, "n columns"]:

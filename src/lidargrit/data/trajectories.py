@@ -1,0 +1,40 @@
+"""Poses of a recording: a folder of KITTI's poses.txt and times.txt, or a file in TUM's form → :class:`Trajectory`."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidargrit.core.errors import DataError
+from lidargrit.data.datasets.shared.odometry import motions, table
+from lidargrit.scans.motion import Trajectory
+
+_TUM = "rows of 8 numbers: time in s, x, y, z in m, and a quaternion qx, qy, qz, qw"
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read the poses of a sensor over time.
+
+    Args:
+        path: folder with ``poses.txt``, ``times.txt`` and ``calib.txt`` as a sequence of KITTI odometry has them; or a
+            file of rows ``time x y z qx qy qz qw``, poses of the lidar itself, as evo, KISS-ICP and other odometries
+            write them.
+
+    Source:
+        Geiger et al., CVPR 2012 (KITTI); Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
+    """
+    if path.is_dir():
+        known = [one for one in motions(path) if one.time_s is not None and one.pose is not None]
+        times_s = np.array([one.time_s for one in known], dtype=np.float64)
+        poses = np.array([one.pose.numpy() for one in known if one.pose is not None]).reshape(-1, 4, 4)
+        return Trajectory(times_s, poses, str(path))
+    if not path.is_file():
+        wanted = f"a folder with poses.txt, times.txt and calib.txt, or a file of {_TUM}"
+        raise DataError(f"{path}, which is not there", wanted, "check the path")
+    rows = table(path, 8, _TUM)
+    if not bool((np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.01).all()):
+        raise DataError(f"a quaternion of {path} whose length is not 1", _TUM, "restore the file")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return Trajectory(rows[:, 0], poses, str(path))
