@@ -134,8 +134,9 @@ def _entries(file: Path) -> dict[str, tuple[str, str]]:
 
 
 def _the_one(kind: str, name: str, chosen: Callable[[object, str], T | None]) -> T:
-    known = names(kind)
-    if name not in known:
+    if name not in names(kind):
+        _found_in.cache_clear()  # its file may have been added since
+    if name not in (known := names(kind)):
         raise UnknownNameError(
             f"{name!r}, which is not among the {kind}",
             f"one such as {nearest_names(name, known)}",
