@@ -2,12 +2,13 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from lidargrit import simulate
+from lidargrit import project, simulate
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.datasets import open_dataset
@@ -370,3 +371,18 @@ def test_argoverse_gives_the_table_of_the_vlp32c(real):
     assert median < 0.05
     assert worst < 0.1
     assert column_azimuths_rad(fit.sensor.width).shape == fit.sensor.azimuth_rad.shape
+
+
+@pytest.mark.parametrize(("name", "columns", "edge"), [("os1_64", 256, 0.5), ("hdl32e", 276, 0.0)])
+def test_points_that_lie_half_a_column_off_keep_a_pixel_each_or_are_told(name, columns, edge):
+    """Ouster's firings are on the borders of columns that begin at +pi; 276 columns are no multiple of eight."""
+    sensor = load_sensor(name).with_columns(columns, 1)
+    sensor = replace(sensor, azimuth_offset_rad=None)
+    edge_rad = math.pi + edge * 2 * math.pi / columns
+    sensor = replace(sensor, first_edge_rad=edge_rad, azimuth_rad=column_azimuths_rad(columns, first_edge_rad=edge_rad))
+    scans = [simulate(seed, sensor) for seed in range(3)]
+    fit = fit_sensor(scans)
+    told = any("share a pixel" in warning for warning in fit.warnings)
+    hidden = 1 - int(project(scans[0], fit.sensor).return_mask.sum()) / len(scans[0])
+    assert (hidden <= 0.01) != told
+    assert told == (columns % 8 != 0)

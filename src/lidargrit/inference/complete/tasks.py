@@ -41,7 +41,8 @@ class Task(ABC):
     def see(self, scan: Scan, model: Model) -> InputScan:
         """Return a cloud on the rays that all of its points lie on."""
         grid = self.grid(scan, model.sensor)
-        return replace(self.reader(grid.sensor, model.projection_variant).read(scan), grid=grid)
+        reader = replace(self.reader(grid.sensor, model.projection_variant), projection=model.projection)
+        return replace(reader.read(scan), grid=grid)
 
     @abstractmethod
     def condition(self, seen: InputScan, seed: int) -> Observed:

@@ -18,6 +18,7 @@ from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.inference.segment.points import labels_of_points
 from lidargrit.inference.segment.scores import LabelScores
 from lidargrit.scans.classes import CLASS_BITS, as_semantic_kitti
+from lidargrit.scans.sensors import ProjectionOption
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
 
@@ -54,7 +55,7 @@ def segment_scans(
     segmenter = open_segmenter(model, device)
     source_scans = _opened(source, segmenter, config)
     source_scans.check_output(out)
-    labels = _Labels(source_scans, segmenter)
+    labels = _Labels(source_scans, segmenter, config.projection)
     files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
     identities = [source_scans.identity(index) for index in range(len(files))]
     facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment"))}
@@ -95,12 +96,13 @@ class _Labels:
     Args:
         scans: scans of the source.
         segmenter: segmenter of a run.
+        projection: way in which points find their rows.
     """
 
-    def __init__(self, scans: NamedScans, segmenter: Segmenter) -> None:
+    def __init__(self, scans: NamedScans, segmenter: Segmenter, projection: ProjectionOption) -> None:
         self._scans, self._segmenter = scans, segmenter
         self._reader, self._told = (
-            ScanReader(segmenter.sensor.fine(), partial=True, few_rings_cure=_FEW_RINGS_CURE),
+            ScanReader(segmenter.sensor.fine(), "exact", True, projection, _FEW_RINGS_CURE),
             set[str](),
         )
 

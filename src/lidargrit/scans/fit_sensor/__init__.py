@@ -13,6 +13,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
 from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
+from lidargrit.scans.fit_sensor.known import notes_on_sensor
 from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
@@ -126,7 +127,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=(*_notes_of(scans), *_warnings(rows, rings, len(scans), columns)),
+        warnings=(*_notes_of(scans), *notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns)),
     )
 
 
@@ -211,8 +212,7 @@ def _model(
         offsets = offsets_deg(used, row_of_point, len(rows.number), rings.lasers)
         if offsets is not None and float(np.ptp(offsets)) < _SHIFT_ASIDE_DEG:
             offsets = None
-    # The nearest number that networks can halve three times: four columns more or less, of hundreds.
-    halved = _HALVED * max(1, round((columns or _COLUMNS_UNCLEAR) / _HALVED))
+    halved = _halved(columns or _COLUMNS_UNCLEAR)
     edge_rad = first_edge_rad(used, row_of_point, halved) if halved == columns else math.pi
     return SensorModel(
         name=name,
@@ -225,6 +225,11 @@ def _model(
         azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
         first_edge_rad=edge_rad,
     )
+
+
+def _halved(columns: int) -> int:
+    """Return the nearest number that networks can halve three times: four columns more or less, of hundreds."""
+    return _HALVED * max(1, round(columns / _HALVED))
 
 
 def _projection(rows: FittedRows, rings: Rings) -> ProjectionName:
@@ -256,6 +261,11 @@ def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | Non
         found.append(f"only {scans}: rings that met little may be off; give {_FEW_SCANS} or more")
     if columns is None:
         found.append(f"the step between firings is not clear; {_COLUMNS_UNCLEAR} columns were assumed")
+    elif _halved(columns) != columns:
+        found.append(
+            f"the sensor fires in {columns:,} columns; the file has {_halved(columns):,}, which networks can halve, so "
+            f"that some points share a pixel (--columns {columns} keeps them apart where a command takes it)"
+        )
     if rings.method == "elevation clusters":
         found.append("the files do not tell which laser fired a point: rows are where elevations gather")
     poor = int((rows.num_points < 0.05 * np.median(rows.num_points)).sum())

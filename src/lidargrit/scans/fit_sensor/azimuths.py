@@ -16,7 +16,8 @@ _PART_AT_LEAST, _PART_AT_MOST = 0.4, 1.5  # of the commonest step: an encoder ro
 _AROUND = (0.95, 1.05)  # of the columns that the mean of such steps makes; wider, rounded azimuths mirror the number
 _SCANS_FOR_COLUMNS = 4  # about; one would do, if its street were full
 _SCANS_AGREE = 3  # at least: within one scan, points of any turning sensor line up
-_AGREE = 0.5  # of points that all lie in the middle of columns; about 0 where they lie anywhere
+_IN_COLUMNS = 0.2  # of 1 where all points of a scan lie at one place in their columns; 0.01 where they lie anywhere
+_AGREE = 0.98  # of 1 where that place is the same in all scans; three that turn freely reach it once in 200 times
 _ASIDE = 0.1  # of a column: less is the noise of azimuths
 _STANDS_OUT = 8.0  # times what azimuths without a step reach
 
@@ -70,13 +71,14 @@ def first_edge_rad(scans: Sequence[Points], rings: Sequence[Int64[np.ndarray, "_
     """
     if len(scans) < _SCANS_AGREE:
         return math.pi
-    total, count = 0j, 0
+    places = []
     for points, ring in zip(scans, rings, strict=True):
         far = (points.range_m > _FAR_M) & (ring >= 0)
-        total += np.exp(1j * columns * np.radians(points.azimuth_deg[far])).sum()
-        count += int(far.sum())
+        places.append(np.exp(1j * columns * np.radians(points.azimuth_deg[far])).sum() / max(1, int(far.sum())))
+    total, sizes = complex(sum(places)), np.abs(places)
     aside_rad = float(np.angle(-total * np.exp(-1j * columns * math.pi)))  # 2 pi for a whole column
-    if abs(total) < _AGREE * count or abs(aside_rad) < _ASIDE * 2 * math.pi:
+    apart = float(sizes.mean()) < _IN_COLUMNS or abs(total) < _AGREE * float(sizes.sum())
+    if apart or abs(aside_rad) < _ASIDE * 2 * math.pi:
         return math.pi
     return math.pi + aside_rad / columns
 
