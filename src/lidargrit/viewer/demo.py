@@ -33,7 +33,7 @@ from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.training import check_folder, train
 from lidargrit.training.fine_tuning import divided
 from lidargrit.training.log import LOG_FILE, read_log
-from lidargrit.training.taken_stages import donors_of_stages
+from lidargrit.training.plan import check_stages
 from lidargrit.viewer import plot_comparison
 from lidargrit.viewer.demo_page import DemoPage, write_demo_page
 from lidargrit.viewer.scan_sets import ScanSet
@@ -163,11 +163,9 @@ def write_results_page(
     """Write the page ``demo.html`` into a run's folder.
 
     Args:
-        generator: a generator over tokens.
         kind: kind of the scans: "real" or "simulated".
         val: held-out scans; the page follows the first of them.
         samples: scans that the generator sampled.
-        errors: errors of reconstruction.
         card: scores of the samples against training scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
@@ -235,7 +233,7 @@ def _preset(data: str | None, settings: list[str], anew: bool) -> Preset:
 
 
 def _trained_stages(preset: Preset) -> list[str]:
-    donors = donors_of_stages(preset, tuple(_STAGES))
+    donors = check_stages(preset).donors
     return [stage for stage in _STAGES if stage in preset.training and stage not in donors]
 
 
