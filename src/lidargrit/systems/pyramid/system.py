@@ -3,13 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -31,7 +34,7 @@ _SHARES = (1 / 16, 1 / 8, 1 / 2)  # of a batch, from which the finest levels lea
 
 
 @dataclass(frozen=True)
-class PyramidConfig:
+class PyramidConfig(Settings):
     """The levels and their networks.
 
     Args:
@@ -44,20 +47,13 @@ class PyramidConfig:
         finest_parent_width: number of channels of that network for the scan itself.
     """
 
-    levels: int = 6
+    levels: Annotated[int, Bounds(2, _LEVELS_AT_MOST)] = 6
     pixels: PixelDecoderConfig = field(default_factory=PixelDecoderConfig)
-    coarse_range_width: int = 48
-    top_range_width: int = 64
-    parent_width: int = 48
-    parent_blocks: int = 4
-    finest_parent_width: int = 32
-
-    def __post_init__(self) -> None:
-        if not 2 <= self.levels <= _LEVELS_AT_MOST:
-            raise ConfigError(f"levels={self.levels}", f"2 to {_LEVELS_AT_MOST}", "correct it")
-        for name in ("coarse_range_width", "top_range_width", "parent_width", "parent_blocks", "finest_parent_width"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
+    coarse_range_width: Count = 48
+    top_range_width: Count = 64
+    parent_width: Count = 48
+    parent_blocks: Count = 4
+    finest_parent_width: Count = 32
 
 
 class Pyramid(Generator[PyramidConfig, PixelSampling]):
