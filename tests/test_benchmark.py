@@ -68,7 +68,7 @@ def test_a_run_named_by_dots_has_the_name_of_its_folder(tmp_path, monkeypatch):
 
 def test_a_preset_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_path, capsys):
     words = ["compare", str(tmp_path), "r2dm_small:steps=1", "r2dm_small:steps=2", "--flops", "1e9", "-n", "2"]
-    assert main([*words, "--against", "simulated:2:test", "--metrics", "bev_jsd", "--set", *FEW, *NARROW]) == 0
+    assert main([*words, "--reference", "simulated:2:test", "--metrics", "bev_jsd", "--set", *FEW, *NARROW]) == 0
     output = capsys.readouterr().out
     assert "bev_jsd" in output
     assert "sliced_wasserstein" not in output
@@ -140,7 +140,7 @@ def test_the_reference_is_projected_once_for_all_systems_of_a_sensor(tmp_path, m
 
 def test_bounds_of_another_data_set_are_warned_of(tmp_path, capsys):
     load("kitti_odometry").write_example(tmp_path / "real", 2)
-    words = ["-n", "2", "--metrics", "bev_jsd", "--against", str(tmp_path / "real")]
+    words = ["-n", "2", "--metrics", "bev_jsd", "--reference", str(tmp_path / "real")]
     assert main(["compare", str(tmp_path / "table"), "marginal", "memorised", *words, "--set", *FEW]) == 0
     (line,) = (line for line in capsys.readouterr().err.splitlines() if "bound no score" in line)
     assert line.startswith("WARNING: marginal and memorised would learn from simulated:6:train, another data set ")
@@ -287,8 +287,8 @@ def test_an_a100_takes_days_or_minutes():
 
 
 def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
-    words = ["--against", "simulated:4:test", "-n", "4", "--metrics", "bev_jsd", "--set", *FEW]
-    assert main(["compare", str(tmp_path), "marginal", "memorised", "--processes", "2", *words]) == 0
+    words = ["--reference", "simulated:4:test", "-n", "4", "--metrics", "bev_jsd", "--set", *FEW]
+    assert main(["compare", str(tmp_path), "marginal", "memorised", "--workers", "2", *words]) == 0
     output = capfd.readouterr().err
     assert "1 of 2 systems are done; left, for about" in output
     assert "marginal: marginal:" in output, "lines of processes begin with the run"
@@ -304,7 +304,10 @@ def test_processes_make_a_table_that_can_be_extended(tmp_path, capfd):
     assert (tmp_path / "table.html").read_text().count("<tr>") == 1 + 3 + 1
     for wrong, got in (
         (["--add", "lidargrit_small", "-n", "5"], "--add with settings of its own (-n)"),
-        (["--add", "lidargrit_small", "--against", "simulated:256:test"], "--add with settings of its own (--against)"),
+        (
+            ["--add", "lidargrit_small", "--reference", "simulated:256:test"],
+            "--add with settings of its own (--reference)",
+        ),
         (["lidargrit_small", "--add", "lidargrit_demo"], "--add with systems before it"),
         (["--add", str(tmp_path)], f"{tmp_path}, a folder that holds no finished run"),
     ):

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 
 import lidargrit
@@ -57,3 +58,19 @@ def test_the_callback_keeps_some_of_the_points_as_they_are_and_turns_right_to_le
     assert 0.3 < len(kept) / (CHANNELS * COLUMNS) < 1
     across = np.hypot(*kept[:, :2].T)
     assert (across[kept[:, 1] < -0.55 * across] < 5.1).all(), "the wall is on the right, which is negative y"
+
+
+@pytest.mark.parametrize("name", ["I", "CosAngle"])
+def test_files_that_carla_saves_are_read_with_y_to_the_left_and_said_so(name, tmp_path):
+    rows = np.frombuffer(measured(wall_right_m=5.0), np.float32).reshape(-1, 4)[::50]
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property float32 {axis}" for axis in ("x", "y", "z", name)]
+    text = "\n".join([*lines, "end_header", *(" ".join(f"{value:.4f}" for value in row) for row in rows), ""])
+    (tmp_path / "carla.ply").write_text(text)
+    scan = lidargrit.load_scan(tmp_path / "carla.ply")
+    assert torch.allclose(scan.points_xyz_m, torch.from_numpy(rows[:, :3] * np.float32([1, -1, 1])), atol=1e-3)
+    assert any("left-handed" in note for note in scan.notes)
+    (tmp_path / "other.ply").write_text(text.replace("float32", "float"))
+    other = lidargrit.load_scan(tmp_path / "other.ply")
+    assert torch.allclose(other.points_xyz_m, torch.from_numpy(rows[:, :3].copy()), atol=1e-3)
+    assert not any("left-handed" in note for note in other.notes)

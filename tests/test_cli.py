@@ -130,7 +130,7 @@ def test_dry_run_fails_where_the_training_would_for_lack_of_scans(data, tmp_path
 
 
 def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
-    words = ["-o", str(tmp_path / "prepared"), "--columns", "64", "--workers", "1"]
+    words = ["-o", str(tmp_path / "prepared"), "--set", "data.columns=64", "--workers", "1"]
     assert main(["prepare", "simulated:2:train", *words]) == 0
     settings = [f"data.train={tmp_path / 'prepared'}", "data.val=simulated:2", "data.columns=128"]
     capsys.readouterr()
@@ -200,9 +200,8 @@ def test_a_seed_gives_the_same_sample_whatever_is_drawn_beside_it(run_folder, sa
 
 
 def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
-    typed(
-        "sample", run_folder, tmp_path, "-n", 2, "--set", "temperature=0", "--set", "mask=threshold", "--device", "cpu"
-    )
+    settings = ("--set", "sampling.temperature=0", "--set", "sampling.mask=threshold")
+    typed("sample", run_folder, tmp_path, "-n", 2, *settings, "--device", "cpu")
     images = read_samples(tmp_path).batch([0, 1])
     assert torch.equal(images.range_m[0], images.range_m[1]), "the likeliest tokens do not depend on the seed"
     manifest = json.loads((tmp_path / "samples.json").read_text())
@@ -252,7 +251,9 @@ def test_evaluate_one_variant_of_some_scans_twice_gives_the_same(samples, typed)
 
 
 def test_evaluate_real_against_real(typed):
-    assert "3 v 3" in typed("evaluate", "simulated:3:train", "simulated:3:test", "--projection-variant", "reference")
+    assert "3 v 3" in typed(
+        "evaluate", "simulated:3:train", "simulated:3:test", "--set", "data.projection_variant=reference"
+    )
 
 
 def test_view_draws_runs_samples_and_scans(run_folder, samples, tmp_path, typed):
@@ -285,7 +286,9 @@ def test_list_names_everything_there_is(typed):
         for name in discovery.names(kind):
             assert f"  {name} " in output
             assert f"  {name} " in in_full
-    assert "sample --set: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed("list", "generators")
+    assert "sample --set sampling.NAME: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed(
+        "list", "generators"
+    )
     assert "licence: " in typed("list", "datasets")
     assert "      higher is better: no\n      variants: " in typed("list", "metrics")
     assert "      rows: 64\n      columns: " in typed("list", "sensors")

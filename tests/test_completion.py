@@ -256,8 +256,14 @@ def test_a_file_that_was_cut_off_is_refused_and_bare_coordinates_stay_bare(tmp_p
 
 def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, capsys):
     table = tmp_path / "table.json"
-    words = ["compare-completion", f"{folders}/scans", f"{folders}/run", f"{folders}/run:mask=threshold"]
-    assert main([*words, "nearest", "triangulation", "--observed", "rows:4", "pixels:0.3", "--json", str(table)]) == 0
+    models = [f"{folders}/run", f"{folders}/run:mask=threshold", "nearest", "triangulation"]
+
+    def compared(folder, models, *more):
+        words = ["compare", str(tmp_path / folder), *models, "--protocol", "completion"]
+        return main([*words, "--reference", f"{folders}/scans", *more])
+
+    assert compared("out", models, "--observed", "rows:4", "pixels:0.3", "--json", str(table)) == 0
+    assert (tmp_path / "out" / "completion.json").read_bytes() == table.read_bytes()
     output = capsys.readouterr().out
     scores = json.loads(table.read_text())["scores"]
     assert [score["observed"] for score in scores] == ["rows:4"] * 4 + ["pixels:0.3"] * 4
@@ -268,9 +274,13 @@ def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, cap
     assert run["diversity_m"]["value"] > 0.1
     difference = nearest["mae_m"]["value"] - triangles["mae_m"]["value"]
     assert nearest["beside_triangulation_m"]["value"] == pytest.approx(difference)
-    assert main([*words[:2], "nearest", "--observed", "returns", "--sensor", f"{folders}/sensor.json"]) == 2
+    assert compared("out", ["nearest"]) == 2
+    assert "completion.json, which is there already" in capsys.readouterr().err
+    assert compared("other", ["nearest"], "--flops", "1e9") == 2
+    assert "got --flops with --protocol completion" in capsys.readouterr().err
+    assert compared("other", ["nearest"], "--observed", "returns", "--sensor", f"{folders}/sensor.json") == 2
     assert "got --observed returns, which hides no return of these scans" in capsys.readouterr().err
-    assert main([*words[:2], f"{folders}/run:mask=guess"]) == 2
+    assert compared("other", [f"{folders}/run:mask=guess"]) == 2
     assert "mask=guess" in capsys.readouterr().err
 
 
@@ -305,20 +315,26 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
         (["complete", "{}/wide_samples", "--model", "{}/run"], "range images of 64x64 of the sensor"),
         (["complete", "{}/scans", "--model", "nothing"], "nothing, which does not exist"),
         (["complete", "{}/scans", "--model", "trianglation"], "wanted a run's folder, or triangulation; check"),
-        (["complete", "{}/scans", "--model", "linear", "-n", "2"], "-n 2 for linear; wanted 1"),
-        (["complete", "{}/scans", "--model", "{}/run", "-n", "0"], "-n 0; wanted at least 1"),
+        (["complete", "{}/scans", "--model", "linear", "--samples", "2"], "--samples 2 for linear; wanted 1"),
+        (["complete", "{}/scans", "--model", "{}/run", "--samples", "0"], "--samples 0; wanted at least 1"),
         (["raydrop", "{}/scans", "--model", "{}/run", "--probability", "-1"], "--probability -1; wanted 0 or more"),
-        (["complete", "{}/scans", "--model", "{}/run", "-n", "9999999"], "9,999,999 completions of each of 2 scans"),
+        (
+            ["complete", "{}/scans", "--model", "{}/run", "--samples", "9999999"],
+            "9,999,999 completions of each of 2 scans",
+        ),
         (["complete", "{}/scans", "--model", "{}/run", "--format", "las2"], "the format 'las2' to write"),
         (["complete", "{}/scans", "--model", "{}/run", "--format", "docx"], "wanted image, kitti_odometry, "),
         (
             ["raydrop", "{}/scans", "--model", "linear"],
             "--model linear, a classical method, which takes pixels of which range and return are known; wanted a run",
         ),
-        (["complete", "{}/scans", "--model", "linear", "--set", "a=1"], "--model linear for --set a=1; wanted a run"),
         (
-            ["upsample", "{}/sparse", "--model", "linear", "--sensor", "vlp16", "--to", "os1_64", "-n", "3"],
-            "-n 3 for linear; wanted 1",
+            ["complete", "{}/scans", "--model", "linear", "--set", "sampling.a=1"],
+            "--model linear for --set a=1; wanted a run",
+        ),
+        (
+            ["upsample", "{}/sparse", "--model", "linear", "--sensor", "vlp16", "--to", "os1_64", "--samples", "3"],
+            "--samples 3 for linear; wanted 1",
         ),
         (["upsample", "{}/sparse", "--model", "linear", "--sensor", "vlp16"], "name it with --to"),
         (["upsample", "{}/scans", "--model", "{}/run", "--sensor", "hdl64e_kitti_odometry"], "with 64 rows from"),
@@ -347,8 +363,8 @@ def test_mistakes_are_told_in_one_line_and_nothing_is_written(words, message, fo
     (folders / "empty.npz").write_bytes(b"")
     words = [word.replace("{}", str(folders)) for word in words]
     assert main([*words[:2], str(tmp_path / "out"), *words[2:]]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
+    told = capsys.readouterr().err.splitlines()
+    (error,) = [line for line in told if "no sensor is named" not in line]
     assert message.split("; ")[0].replace(".*", "").split(" in ")[0] in error
     assert not (tmp_path / "out").exists()
 

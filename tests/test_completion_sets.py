@@ -58,7 +58,7 @@ def complete(run, source, out, *words) -> int:
 
 def test_more_scans_of_a_set_change_none(run, tmp_path):
     source = scan_files(tmp_path / "scans", 4)
-    for words in (("--max-scans", "2"), ()):
+    for words in (("-n", "2"), ()):
         assert complete(run, source, tmp_path / "grown", *words) == 0
     assert complete(run, source, tmp_path / "whole") == 0
     for number in range(4):
@@ -71,7 +71,7 @@ def test_images_of_a_set_keep_their_seeds_too(run, tmp_path):
     for number in range(4):
         np.save(tmp_path / "images" / f"{number}.npy", wall(SENSOR, 0).range_m.numpy())
     words = ("--format", "image")
-    assert complete(run, str(tmp_path / "images"), tmp_path / "some", "--max-scans", "2", *words) == 0
+    assert complete(run, str(tmp_path / "images"), tmp_path / "some", "-n", "2", *words) == 0
     assert complete(run, str(tmp_path / "images"), tmp_path / "all", *words) == 0
     for path in (tmp_path / "some").glob("*.npy"):
         assert np.array_equal(np.load(path), np.load(tmp_path / "all" / path.name))
@@ -165,7 +165,7 @@ def test_a_doubt_about_the_sensor_is_told_once(tmp_path, heard):
     assert inputs.read(1).doubt
     warnings = [line for line in heard if line.startswith("WARNING: ")]
     assert len(warnings) == 1
-    assert "take a model of the sensor that made the scan, or name that sensor" in warnings[0]
+    assert "name the sensor that made the scan with --sensor, or take a model of it" in warnings[0]
 
 
 def test_points_without_a_pixel_are_counted_once(tmp_path, heard):

@@ -35,7 +35,7 @@ def test_pictures_poses_and_labels_beside_scans_are_none(tmp_path, capsys):
     found = open_dataset(str(tmp_path / "scans"))
     assert [found.name(index) for index in range(len(found))] == ["b"]
     assert found.notes[0].startswith("3 files .csv, .npy, .png beside the scans left out, such as ")
-    more = ["--sensor", "vlp16", "--columns", "90"]
+    more = ["--sensor", "vlp16", "--set", "data.columns=90"]
     for words in (
         ["prepare", str(tmp_path / "scans"), "-o", str(tmp_path / "p")],
         ["inspect", str(tmp_path / "scans")],

@@ -274,8 +274,12 @@ def test_settings_that_only_completion_reads_are_no_settings_of_sampling(name):
     for setting in cls.not_of_sampling:
         with pytest.raises(ConfigError, match=f"'{setting}', which sampling does not have"):
             configuration.override(cls.Sampling(), [f"{setting}=1"], "sampling", fixed=cls.not_of_sampling)
-        assert any(line.startswith("complete --set besides: ") and setting in line for line in cls.about())
-        assert not any(line.startswith("sample --set: ") and f"{setting}=" in line for line in cls.about())
+        assert any(
+            line.startswith("complete --set sampling.NAME besides: ") and setting in line for line in cls.about()
+        )
+        assert not any(
+            line.startswith("sample --set sampling.NAME: ") and f"{setting}=" in line for line in cls.about()
+        )
 
 
 def test_what_it_cannot_do_is_told_with_who_can(name):

@@ -99,7 +99,7 @@ def test_verbs_say_what_was_left_out(tmp_path, capsys):
     for words in (
         ["inspect", str(path), "--sensor", "vlp16"],
         ["export", str(path), str(tmp_path / "out"), "--format", "npz"],
-        ["prepare", str(path), "-o", str(tmp_path / "prepared"), "--sensor", "vlp16", "--columns", "90"],
+        ["prepare", str(path), "-o", str(tmp_path / "prepared"), "--sensor", "vlp16", "--set", "data.columns=90"],
         ["fit-sensor", str(path), "-o", str(tmp_path / "mine.json")],
     ):
         assert main(words) == 0

@@ -93,10 +93,10 @@ def test_an_import_is_a_run_that_all_verbs_take(files, tmp_path, capsys):
     model = lidargrit.load(run)
     assert all(torch.equal(of, model.tokenizer.state_dict()[name]) for name, of in drawn("tokenizer").items())
     assert all(torch.equal(of, model.transformer.state_dict()[name]) for name, of in drawn("transformer").items())
-    assert main(["sample", run, samples, "-n", "2", "--set", "top_k=5"]) == 0
+    assert main(["sample", run, samples, "-n", "2", "--set", "sampling.top_k=5"]) == 0
     assert json.loads((tmp_path / "samples" / "samples.json").read_text())["projection_variant"] == "reference"
     assert main(["evaluate", samples, "simulated:2:test", "--metrics", "sliced_wasserstein", "--intervals", "0"]) == 0
-    assert main(["evaluate", run, "simulated:2:test"]) == 0
+    assert main(["likelihood", "simulated:2:test", "--model", run]) == 0
     assert main(["view", run, "-o", str(tmp_path / "run.png"), "-n", "1"]) == 0
 
 

@@ -215,8 +215,23 @@ def test_raydrop_learns_what_a_class_does():
 
 
 def test_right_classes_are_counted_where_both_scans_return(folders, tmp_path, capsys):
-    words = ["compare-completion", f"kitti_odometry:{folders / 'tree'}", "nearest", f"{folders}/run"]
-    assert main([*words, "--observed", "rows:4", "-n", "2", "--device", "cpu"]) == 0
+    words = ["compare", str(tmp_path / "out"), "nearest", f"{folders}/run", "--protocol", "completion"]
+    assert (
+        main(
+            [
+                *words,
+                "--reference",
+                f"kitti_odometry:{folders / 'tree'}",
+                "--observed",
+                "rows:4",
+                "-n",
+                "2",
+                "--device",
+                "cpu",
+            ]
+        )
+        == 0
+    )
     table = capsys.readouterr().out
     assert "class accuracy" in table
     nearest = next(line for line in table.splitlines() if line.startswith("nearest")).split()

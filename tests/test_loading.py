@@ -143,7 +143,7 @@ def test_a_folder_prepared_from_what_has_changed_is_called_stale(tree, tmp_path)
 def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache, heard):
     bad = KittiOdometry(tree).path(3)
     bad.write_bytes(b"")
-    with pytest.raises(ScanError, match=r"leave such scans out by --set data.bad_scans=skip"):
+    with pytest.raises(ScanError, match=r"leave such scans out by --bad-scans skip"):
         load(tree)
     assert not list(cache.rglob("*.shard"))
     config = DataConfig(bad_scans="skip")
@@ -195,7 +195,7 @@ def test_machines_share_the_work_and_wait_for_one_another(tree, tmp_path, small_
 
 def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
     KittiOdometry(tree).path(4).write_bytes(bytes(33))
-    with pytest.raises(ScanError, match=r"got 33 bytes in .*data.bad_scans=skip"):
+    with pytest.raises(ScanError, match=r"got 33 bytes in .*--bad-scans skip"):
         load(tree, workers=2)
 
 

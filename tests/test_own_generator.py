@@ -41,7 +41,16 @@ def test_the_file_of_the_page_is_compared_without_a_preset(code, tmp_path, capsy
     lines = [line for line in code.read_text().splitlines() if line and not line.startswith(("import", "from", '"""'))]
     assert len(lines) < 40
     monkeypatch.setattr(lidargrit.generation.presets, "_SCANS", 8)
-    words = ["compare", str(tmp_path / "table"), "marginal", "mean_street", "--against", "simulated:2:test", "-n", "2"]
+    words = [
+        "compare",
+        str(tmp_path / "table"),
+        "marginal",
+        "mean_street",
+        "--reference",
+        "simulated:2:test",
+        "-n",
+        "2",
+    ]
     words += ["--metrics", "bev_jsd", "--json", str(tmp_path / "table.json"), "--set", *QUICK]
     assert main(words) == 0
     table = capsys.readouterr().out

@@ -16,7 +16,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation.estimates import Estimate
-from lidargrit.evaluation.likelihood import _maps, score_likelihood
+from lidargrit.evaluation.likelihood import _maps
+from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.batches import in_batches
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
@@ -291,26 +292,19 @@ def test_all_of_it_is_trained_saved_and_read_again(tmp_path):
     assert torch.equal(trained.sample([5]).range_m, again.sample([5]).range_m)
 
 
-def test_evaluate_tells_bits_by_stage(tmp_path, capsys):
-    made().save(tmp_path / "run")
-    config = DataConfig(train=("simulated:2:test",), val=("simulated:2:test",), columns=512, column_stride=8)
-    images = load_range_images(config.train, config)
-    expected = score_likelihood(made(), images).by_natural_unit()
-    single = made().bits(images.batch([0, 1])).per_scan()["mask"] / (64 * 64)
-    assert expected["mask_bits_per_pixel"] == pytest.approx(float(single.mean()), rel=1e-5)
-    assert main(["evaluate", str(tmp_path / "run"), "simulated:2:test", "--json"]) == 0
-    errors = json.loads(capsys.readouterr().out)["reconstruction"]
-    assert errors["range_bits_per_return"] == pytest.approx(expected["range_bits_per_return"], rel=1e-3)
-    assert errors["range_mae_m"] > 0
-
-
 def test_the_likelihood_of_a_source_is_told_and_its_map_written(tmp_path, capsys):
     made().save(tmp_path / "run")
     words = ["likelihood", "simulated:2:test", "--model", str(tmp_path / "run"), "--map", str(tmp_path / "bits.npy")]
     assert main([*words, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["whole_scan"]
-    assert found["num_scans"] == 2
+    assert found["num_scans"] == found["reconstruction"]["num_scans"] == 2
+    config = DataConfig(train=("simulated:2:test",), columns=512, column_stride=8)
+    images = load_range_images(config.train, config)
+    bits = made().bits(images.batch([0, 1])).per_scan()["mask"] / (64 * 64)
+    assert found["bits"]["mask"]["pixel"]["value"] == pytest.approx(float(bits.mean()), rel=1e-5)
+    errors = score_reconstruction(made().get_tokenizer(), images)
+    assert found["reconstruction"]["range_mae_m"] == pytest.approx(errors.range_mae_m, rel=1e-3)
     of_scans = [sum(scan[part] for part in ("tokens", "mask", "range")) for scan in found["scans"]]
     assert found["bits"]["all"]["scan"]["value"] == pytest.approx(sum(of_scans) / 2)
     returns = sum(scan["returns"] for scan in found["scans"])
@@ -330,7 +324,7 @@ def test_compare_tells_the_bits_of_whole_scans_where_a_system_has_them(tmp_path,
     made().save(tmp_path / "with_pixels")
     made(None).save(tmp_path / "tokens_alone")
     systems = [str(tmp_path / "with_pixels"), str(tmp_path / "tokens_alone")]
-    words = ["compare", str(tmp_path / "table"), *systems, "--against", "simulated:2:test", "-n", "2"]
+    words = ["compare", str(tmp_path / "table"), *systems, "--reference", "simulated:2:test", "-n", "2"]
     words += ["--metrics", "bev_jsd"]
     assert main([*words, "--json"]) == 0
     with_pixels, tokens_alone = (cell["costs"] for cell in json.loads(capsys.readouterr().out))

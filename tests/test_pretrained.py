@@ -122,7 +122,7 @@ def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
 
 
 def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys):
-    assert main(["evaluate", "pretrained", "simulated:8:test", "--json"]) == 0
+    assert main(["likelihood", "simulated:8:test", "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)["reconstruction"]
     assert errors["range_mae_m"] == pytest.approx(1.128, rel=0.02)
     assert errors["mask_accuracy"] == pytest.approx(0.934, abs=0.004)
@@ -166,7 +166,7 @@ def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
 def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["view", "pretrained", "-n", "1", "-o", "page.html"]) == 0
-    few = ["--against", "simulated:2:test", "-n", "2", "--metrics", "bev_jsd"]
+    few = ["--reference", "simulated:2:test", "-n", "2", "--metrics", "bev_jsd"]
     assert main(["compare", "table", "pretrained", *few]) == 0
     words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "tokenizer_from=pretrained"]
     words += [f"training.transformer.{setting}" for setting in ("scans=2", "batch_size=2", "warmup_scans=0")]

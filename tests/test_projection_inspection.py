@@ -148,7 +148,7 @@ def test_the_picture_is_drawn_even_of_nothing(tmp_path, scale):
 
 
 def test_the_verb_prints_a_table_and_writes_what_it_is_told_to(tmp_path, capsys):
-    command = ["inspect", "simulated:1", "--projection", "spherical", "--columns", "512"]
+    command = ["inspect", "simulated:1", "--projection", "spherical", "--set", "data.columns=512"]
     files = ["-o", str(tmp_path / "it.png"), "--json", str(tmp_path / "it.json")]
     assert main([*command, *files]) == 0
     printed = capsys.readouterr().out

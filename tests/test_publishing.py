@@ -178,7 +178,7 @@ def test_a_model_of_prepared_scans_names_what_they_were_prepared_from(tmp_path, 
     monkeypatch.chdir(tmp_path)
     private = tmp_path / "private_place"
     for split in ("train", "val"):
-        words = ["-o", str(private / split), "--columns", "64", "--workers", "1"]
+        words = ["-o", str(private / split), "--set", "data.columns=64", "--workers", "1"]
         assert main(["prepare", f"simulated:2:{split}", *words]) == 0
     data = [f"data.train={private / 'train'}", "data.val=private_place/val", "data.columns=64"]
     assert main(["train", "marginal", str(private / "run"), "--set", *data]) == 0
@@ -353,10 +353,8 @@ def test_the_name_of_a_source_is_not_worth_a_walk_through_a_disk(tmp_path, monke
 
 
 def test_prepared_scans_are_named_by_what_they_were_prepared_from(tmp_path):
-    assert (
-        main(["prepare", "simulated:2:train", "-o", str(tmp_path / "prepared"), "--columns", "64", "--workers", "1"])
-        == 0
-    )
+    prepared = ["-o", str(tmp_path / "prepared"), "--set", "data.columns=64", "--workers", "1"]
+    assert main(["prepare", "simulated:2:train", *prepared]) == 0
     assert data_set_of(str(tmp_path / "prepared")) == ("simulated", "train")
 
 

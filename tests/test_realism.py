@@ -149,12 +149,13 @@ def test_the_verb(tmp_path, capsys, monkeypatch):
     picture, file = tmp_path / "curves.png", tmp_path / "curves.json"
     torch.manual_seed(0)
     LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR).save(tmp_path / "run")
-    words = ["compare-sim", "simulated:2:val", "-n", "2", "-o", str(picture), "--json", str(file)]
-    words += ["--model", str(tmp_path / "run")]
+    words = ["evaluate", "simulated:2", "simulated:2:val", "--protocol", "streets"]
+    report = ["--report", str(picture), "--json", str(file), "--model", str(tmp_path / "run")]
+    words, few = [*words, *report], words
     assert main(words) == 0
     assert "drop_run_lengths" in capsys.readouterr().out
     found = json.loads(file.read_text())
-    assert found["real"] == "simulated:2:val"
+    assert (found["samples"], found["reference"]) == ("simulated:2", "simulated:2:val")
     assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(found["curves"][0])
     kinds = ["simulated"] * 5 + ["real"] * 5 + ["real_triangulated"] * 5
     assert [score["scans"] for score in found["raydrop"]] == kinds
@@ -164,8 +165,23 @@ def test_the_verb(tmp_path, capsys, monkeypatch):
     assert main([*words, "--overwrite", "--device", "cuda:99"]) == 2
     assert "device 'cuda:99'" in capsys.readouterr().err
     monkeypatch.setattr(realism, "simulate_pair", lambda *_: pytest.fail("it simulates before it looks"))
-    one = ["compare-sim", "simulated:2", "-o", str(tmp_path / "one.png"), "--set", "data.max_scans=1"]
-    assert main(one) == 2
-    assert "got 1 real scan; wanted at least 2" in capsys.readouterr().err
-    assert main(["compare-sim", "simulated:2", "-n", "1", "-o", str(tmp_path / "new.png")]) == 2
-    assert "at least 2" in capsys.readouterr().err
+    for wrong, got in (
+        (["evaluate", "simulated:2", "simulated:1", *few[3:]], "got 1 real scan; wanted at least 2"),
+        ([*few, "-n", "1"], "got 1 simulated scan; wanted at least 2"),
+        (["evaluate", "simulated:2@vlp16", *few[2:]], "got streets of 'vlp16' and scans of 'hdl64e_kitti_odometry'"),
+        ([*few, "--pixel-statistics"], "got --pixel-statistics with --protocol streets"),
+        (["evaluate", "simulated:2", "simulated:2:val", "--model", "pretrained"], "got --model without --tables"),
+        ([*few, "--report", str(tmp_path / "curves.html")], "curves.html, which will hold"),
+    ):
+        assert main(wrong) == 2
+        assert got in capsys.readouterr().err
+
+
+def test_other_samples_are_scored_by_the_curves_of_streets_alone(tmp_path, capsys):
+    torch.manual_seed(0)
+    LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR).save(tmp_path / "run")
+    assert main(["sample", str(tmp_path / "run"), str(tmp_path / "samples"), "-n", "2"]) == 0
+    words = ["evaluate", str(tmp_path / "samples"), "simulated:2", "--protocol", "streets", "--intervals", "0"]
+    assert main([*words, "--json", str(tmp_path / "scores.json")]) == 0
+    found = json.loads((tmp_path / "scores.json").read_text())
+    assert {score["metric"] for score in found["scores"]} | {each["metric"] for each in found["left_out"]} == {*CURVES}

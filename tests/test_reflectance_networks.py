@@ -255,18 +255,16 @@ def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tm
     assert all(own[point] == values[point] for point in kept)
     assert any(values[point] > 0 for point in values.keys() - kept)
     capsys.readouterr()
-    compare, settings = (
-        ["compare-completion", f"{folders}/scans"],
-        ["--observed", "rows:4", "-n", "2", "--device", "cpu"],
-    )
-    assert main([*compare, f"{folders}/run", f"{folders}/plain", "triangulation", *settings]) == 0
+    models = [f"{folders}/run", f"{folders}/plain", "triangulation"]
+    settings = ["--protocol", "completion", "--reference", f"{folders}/scans", "--observed", "rows:4", "-n", "2"]
+    assert main(["compare", str(tmp_path / "one"), *models, *settings, "--device", "cpu"]) == 0
     _, head, run, plain, triangles = capsys.readouterr().out.splitlines()
     assert "reflectance MAE" in head
     column = slice(head.index("reflectance MAE") - 10, head.index("reflectance MAE") + 15)
     errors = [line[column].split() for line in (run, plain, triangles)]
     assert 0 < float(errors[2][0]) < float(errors[0][0]) + 0.05
     assert 0 < float(errors[1][0]) < 1
-    assert main([*compare, f"{folders}/plain/lidargrit", *settings]) == 0  # it has learned none
+    assert main(["compare", str(tmp_path / "two"), f"{folders}/plain/lidargrit", *settings]) == 0  # it has learned none
     assert "reflectance MAE" in capsys.readouterr().out
 
 

@@ -14,11 +14,11 @@ from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.datasets import load
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.evaluation.reproduction import TABLES, Reproduction, reproduce
+from lidargrit.evaluation.reproduction import TABLES, Reproduction, prepare
 from lidargrit.evaluation.tables import published
 from lidargrit.generation.presets import load_preset
 from lidargrit.training import train
-from tiny_runs import MODEL, SIMULATED
+from tiny_runs import MODEL, SIMULATED, the_one_line
 
 STEPS = [  # 4 and 2 of them, a checkpoint after each
     *[f"training.{stage}.scans=16" for stage in ("tokenizer", "transformer")],
@@ -29,7 +29,8 @@ STEPS = [  # 4 and 2 of them, a checkpoint after each
 
 def words_for(folder: Path, *more: str) -> list[str]:
     few = ["-n", "4", "--flops", "0"]
-    return ["reproduce", "3", "simulated", str(folder), "--small", *few, *more, "--set", *MODEL, *SIMULATED, *STEPS]
+    table = ["compare", str(folder), "--paper-table", "3", "--data", "simulated", "--small"]
+    return [*table, *few, *more, "--set", *MODEL, *SIMULATED, *STEPS]
 
 
 def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys):
@@ -67,9 +68,11 @@ def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys)
     ]
     assert weights[0] == weights[1]
 
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/**/*") if path.is_file()}
+    table = (folder / "table.json").read_bytes()
     assert main(words_for(folder)) == 0
-    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()} == before
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/**/*") if path.is_file()} == before
+    assert (folder / "table.json").read_bytes() == table
 
 
 def reproduction_of(folder: Path) -> Reproduction:
@@ -108,7 +111,10 @@ def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
         other = Path(str(scan).replace("drive_0000", f"drive_{drive}"))
         other.parent.mkdir(parents=True)
         other.write_bytes(scan.read_bytes())
-    assert main(["reproduce", "1", str(tmp_path / "root"), str(tmp_path / "out"), "--dry-run"]) == 0
+    assert (
+        main(["compare", str(tmp_path / "out"), "--paper-table", "1", "--data", str(tmp_path / "root"), "--dry-run"])
+        == 0
+    )
     output = capsys.readouterr().out
     for split in ("train_without_val", "val", "test"):
         assert f"prepare kitti_360:{tmp_path / 'root'}:{split}: 1 scans" in output
@@ -120,19 +126,26 @@ def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_settings_that_a_stage_cannot_follow_are_told_before_any_scan(tmp_path, monkeypatch):
+def test_settings_that_a_stage_cannot_follow_are_told_before_any_scan(monkeypatch):
     monkeypatch.delattr("lidargrit.evaluation.reproduction.load_range_images")
     wrong = Reproduction(3, "simulated", small=True, flops=0.0, settings=("training.tokenizer.optimiser=muon",))
     with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
-        reproduce(wrong, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
+        prepare(wrong.benchmark(), [*wrong.systems().values()])
 
 
 def test_another_number_and_another_place_are_refused(tmp_path, capsys):
     with pytest.raises(ConfigError, match="one of 1, 2, 3"):
         Reproduction(4, "simulated")
-    assert main(["reproduce", "2", str(tmp_path), str(tmp_path / "out"), "--dry-run"]) == 2
-    assert "KITTI odometry" in capsys.readouterr().err
+    table = ["compare", str(tmp_path / "out"), "--paper-table", "2"]
+    for words, got in (
+        ([*table, "--data", str(tmp_path), "--dry-run"], "KITTI odometry"),
+        (table, "got --paper-table 2 without --data"),
+        ([*table, "--data", "simulated", "--protocol", "exact"], "got --protocol with --paper-table 2"),
+        ([*table[:2], "marginal", *table[2:], "--data", "simulated"], "got marginal with --paper-table 2"),
+        (["compare", str(tmp_path / "out"), "marginal", "--small"], "got --small without --paper-table"),
+    ):
+        assert main(words) == 2
+        assert got in the_one_line(capsys.readouterr().err, "compare")
 
 
 def differing(first: str, second: str) -> set[str]:

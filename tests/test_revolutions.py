@@ -38,7 +38,16 @@ def test_more_than_one_revolution_is_told(turns, tmp_path, capsys):
     assert told in inspect(scan, load_sensor("vlp16").with_columns(COLUMNS)).problems
     assert told in fit_sensor([scan]).warnings
     np.savez(tmp_path / "a.npz", points=scan.points_xyz_m.numpy(), ring=scan.ring.numpy())
-    words = ["prepare", str(tmp_path / "a.npz"), "-o", str(tmp_path / "p"), "--sensor", "vlp16", "--columns", "90"]
+    words = [
+        "prepare",
+        str(tmp_path / "a.npz"),
+        "-o",
+        str(tmp_path / "p"),
+        "--sensor",
+        "vlp16",
+        "--set",
+        "data.columns=90",
+    ]
     assert main(words) == 0
     output = capsys.readouterr()
     assert "WARNING: " in output.out + output.err

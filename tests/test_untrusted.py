@@ -149,8 +149,8 @@ def test_words_that_are_accepted():
             ],
             "at most 1,000 values",
         ),
-        (["sample", "pretrained", "out", "--set", "temperature=1e400"], "temperature=inf"),
-        (["sample", "pretrained", "out", "--set", f"top_k={10**20}"], "top_k with a number of 67 bits"),
+        (["sample", "pretrained", "out", "--set", "sampling.temperature=1e400"], "temperature=inf"),
+        (["sample", "pretrained", "out", "--set", f"sampling.top_k={10**20}"], "top_k with a number of 67 bits"),
     ],
 )
 def test_commands_refuse_in_one_line(words, got, tmp_path, monkeypatch, capsys):

@@ -8,27 +8,27 @@ import pytest
 
 from lidargrit.cli import build_parser, main
 from lidargrit.core import discovery
-from lidargrit.core.errors import nearest_names
+from lidargrit.core.errors import LidarGritError, nearest_names
 
 MISTAKES = {
     "simulte": "lidargrit: got 'simulte'; wanted one such as simulate; see: lidargrit --help",
     "--verion": "lidargrit: got the option '--verion'; wanted one such as --version; see: lidargrit --help",
     "train": "got no preset and no out; wanted lidargrit train PRESET OUT; see: lidargrit train --help",
-    "simulate here": "got no -n/--num-scans; wanted lidargrit simulate OUT -n NUM_SCANS;",
+    "simulate here": "got no -n/--count; wanted lidargrit simulate OUT -n COUNT;",
     "sample --cuont 3": "got the option '--cuont'; wanted one such as --count; see: lidargrit sample --help",
     "sample run out more": "got the unexpected argument 'more'; wanted fewer arguments;",
     "sample run out -x": "got the option '-x'; wanted one such as",
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
-    "evaluate a b --format pdf": "got --format pdf; wanted text, markdown or latex; choose one",
+    "evaluate a b --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
     "list metric": "wanted one such as metrics; see: lidargrit list --help",
     "demo --set": "got nothing after --set; wanted a value;",
-    "evaluate --pr x": "got --pr; wanted --protocol, --projection or --projection-variant; write it out",
+    "evaluate --pr x": "got --pr; wanted --protocol or --projection; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
     "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
     "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
     "train lidargrit_demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
-    "completion tcsh": "got 'tcsh'; wanted bash, zsh or fish; choose one",
+    "--print-completion tcsh": "got --print-completion tcsh; wanted bash, zsh or fish; choose one",
     "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --variant exakt": "got variant 'exakt'; wanted one such as exact or textbook; choose one",
@@ -103,7 +103,7 @@ def test_json_is_all_of_standard_output_or_a_file_besides(words, capsys, tmp_pat
 
 
 def test_every_verb_that_reports_knows_json():
-    silent = {"complete", "completion", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
+    silent = {"complete", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
     silent |= {"compress", "decompress", "fine-tune", "rescan", "simulate", "upsample", "view"}
     parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
     assert parsers.keys() == {name.replace("_", "-") for name in discovery.names("cli")}
@@ -119,17 +119,29 @@ def test_scores_side_by_side_as_json(capsys, tmp_path):
 
 
 def test_help_tells_the_exit_codes(capsys):
-    for words in (["--help"], ["train", "--help"]):
-        with pytest.raises(SystemExit) as stopped:
+    with pytest.raises(SystemExit) as stopped:
+        main(["--help"])
+    assert stopped.value.code == 0
+    output = capsys.readouterr().out
+    assert all(f"{code} " in output.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
+
+
+def test_help_of_every_verb_fits_a_page(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = {parser.prog: len(parser.format_help().splitlines()) for parser in build_parser().verbs()}
+    assert not {verb: count for verb, count in lines.items() if count > 50}
+
+
+def test_a_traceback_is_shown_on_request_before_the_verb_or_behind_it(capsys):
+    for words in (["--debug", "export", "nowhere", "out"], ["export", "nowhere", "out", "--debug"]):
+        with pytest.raises(LidarGritError, match="nowhere"):
             main(words)
-        assert stopped.value.code == 0
-        output = capsys.readouterr().out
-        assert all(f"{code} " in output.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
+    assert main(["export", "nowhere", "out"]) == 2
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
-    assert main(["completion", shell]) == 0
+    assert main(["--print-completion", shell]) == 0
     script = tmp_path / "script"
     script.write_text(capsys.readouterr().out)
     for word in (*discovery.names("cli"), *discovery.names("presets"), "lidargrit-kitti-360", "dry-run"):
@@ -140,7 +152,7 @@ def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="needs bash")
 def test_bash_completes(capsys, tmp_path):
-    assert main(["completion", "bash"]) == 0
+    assert main(["--print-completion", "bash"]) == 0
     (tmp_path / "script").write_text(capsys.readouterr().out)
     for words, offered in (
         ("tra", "train"),

@@ -67,7 +67,7 @@ def uninterrupted(tmp_path_factory) -> bytes:
 @pytest.mark.parametrize(
     ("words", "follows"),
     [
-        (["compare-completion", "scans"], "the same command begins anew"),
+        (["compare", "out", "marginal"], "the same command goes on"),
         (["evaluate", "one", "other"], "the same command begins anew"),
         (["complete", "scans", "out"], "the same command goes on"),
         (["compress", "scans", "out.lgz"], "the same command goes on"),

@@ -57,7 +57,7 @@ def test_samples_of_a_run_whose_recordings_are_damaged(refused, run_folder, tmp_
 def test_samples_of_another_model_or_drawn_otherwise(refused, finished, samples):
     message = refused("sample", finished["deeper"], samples)
     assert "samples, which holds samples of another model or sampled in another way; wanted" in message
-    assert "sampled in another way" in refused("sample", finished["run"], samples, "--set", "temperature=0.5")
+    assert "sampled in another way" in refused("sample", finished["run"], samples, "--set", "sampling.temperature=0.5")
     assert main(["sample", str(finished["run"]), str(samples), "-n", "2"]) == 0
 
 

@@ -200,13 +200,13 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         ),
         (["sample", "RUN", "OUT", "-n", "0"], r"-n 0; wanted at least one scan"),
         (["sample", "RUN", "OUT", "--seed", "-1"], r"--seed -1; wanted"),
-        (["sample", "RUN", "OUT", "--set", "top_p=0"], r"top_p=0\.0; wanted"),
-        (["sample", "RUN", "OUT", "--set", "temperature=.nan"], r"temperature=nan; wanted a finite number"),
+        (["sample", "RUN", "OUT", "--set", "sampling.top_p=0"], r"top_p=0\.0; wanted"),
+        (["sample", "RUN", "OUT", "--set", "sampling.temperature=.nan"], r"temperature=nan; wanted a finite number"),
         (
-            ["sample", "RUN", "OUT", "--set", "temprature=1"],
+            ["sample", "RUN", "OUT", "--set", "sampling.temprature=1"],
             r"'temprature', which sampling with 'lidargrit' does not have; wanted one such as temperature; .*list gen",
         ),
-        (["sample", "RUN", "OUT", "--set", "mask=never"], r"mask=never; wanted auto, .*threshold"),
+        (["sample", "RUN", "OUT", "--set", "sampling.mask=never"], r"mask=never; wanted auto, .*threshold"),
         (["sample", "RUN", "OUT", "--device", "gpu"], r"device 'gpu'; wanted"),
         (["sample", "nowhere", "OUT"], r"nowhere, which does not exist; .*pretrained"),
         (

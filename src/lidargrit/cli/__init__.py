@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
+from lidargrit.cli._shell import SHELLS, script
 from lidargrit.cli._signals import raising_on_signals
 from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import LidarGritError, Terminated, UsageError
@@ -49,7 +50,7 @@ def _run(words: list[str]) -> int:
         print(f"lidargrit {verb}".rstrip() + f": {error}", file=sys.stderr)
         return 2
     if options.verb is None:
-        parser.print_help()
+        print(script(parser, options.print_completion) if options.print_completion else parser.format_help())
         return 0
     try:
         with _refusing_unusable_paths(), reporting.to(reporting.TerminalReporter()):
@@ -95,9 +96,12 @@ def _let_threads_sleep() -> None:
 
 def build_parser() -> Parser:
     """Return the parser of all verbs; the verbs themselves are not imported beyond their words."""
-    raw: dict[str, Any] = {"formatter_class": HelpFormatter, "epilog": EXIT_CODES}
-    parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, **raw)
+    raw: dict[str, Any] = {"formatter_class": HelpFormatter}
+    parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, epilog=EXIT_CODES, **raw)
     parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show a full traceback of an error")
+    how = "print a script by which this shell completes verbs, options and names, see docs/how-to/from-programs.md"
+    parser.add_argument("--print-completion", choices=SHELLS, default="", help=how)
     verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
     for name in discovery.names("cli"):
         verb = importlib.import_module(f"lidargrit.cli.{name}")
@@ -107,10 +111,11 @@ def build_parser() -> Parser:
             description=f"examples:\n{verb.EXAMPLES}",
             **raw,
         )
-        sub.add_argument("--debug", action="store_true", help="show a full traceback of an error")
+        sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         sub.set_defaults(goes_on=False)  # a verb that keeps what it has done, and goes on there, says so itself
         verb.add_arguments(sub)
         sub.set_defaults(run=verb.run, words=sub)
+        sub.usage = sub.short_usage()
     return parser
 
 

@@ -1,12 +1,13 @@
 """What the verbs complete, upsample and raydrop have in common: their options, and what they say in the end."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidargrit.cli._options import add_bad_scans, add_device, add_settings
+from lidargrit.cli._options import add_count, add_device, add_scans, sampling_words, scan_settings
 from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import seed_number
+from lidargrit.core.untrusted import seed_number, whole_number
 
 if TYPE_CHECKING:
     from lidargrit.inference.complete import Model
@@ -23,19 +24,14 @@ def add_completion(parser: argparse.ArgumentParser, model: str, points_only: boo
     parser.add_argument("scans", help=scans)
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument("--model", default="pretrained", help=model)
+    add_count(parser)
     each = "number of completions of each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
-    parser.add_argument("-n", "--count", type=int, default=1, help=each)
+    parser.add_argument("--samples", type=whole_number, default=1, help=each)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first completion")
-    some = "number of scans to take, evenly spaced; 0 for all"
-    parser.add_argument("--max-scans", type=int, default=0, help=some)
-    kind = (
-        "format of the clouds: bin, pcd, ply, npz, a name from: lidargrit list formats (default: that of each scan's "
-    )
-    kind += "file); or image for the model's range images alone, as .npy"
-    parser.add_argument("--format", default="", help=kind)
-    add_settings(parser, "sampling settings to change, such as temperature=0.9; see: lidargrit list generators")
+    kind = "format of the clouds, a name from: lidargrit list formats (default: that of each scan's file); or image "
+    parser.add_argument("--format", default="", help=kind + "for the model's range images alone, as .npy")
+    add_scans(parser, "settings of sampling, as sampling.temperature=0.9, and of reading scans, as data.columns=1024")
     add_device(parser)
-    add_bad_scans(parser)
 
 
 def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorModel | None") -> "Model":
@@ -45,23 +41,35 @@ def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorMod
         options: parsed options of one of the three verbs.
         task: the work on each scan.
         sensor: sensor that is named for a classical method, which gives whole clouds all of its columns; a run has its
-            own.
+            own, and refuses another.
     """
     from lidargrit.inference.complete import is_classical, open_model
 
     if sensor is not None and is_classical(options.model) and options.format != "image":
         sensor = sensor.fine()
-    return open_model(options.model, task.kind, sensor, options.set, options.device)
+    model = open_model(options.model, task.kind, sensor, sampling_words(options.set), options.device)
+    return replace(model, projection=scan_settings(options).data.projection)
+
+
+def named_sensor(options: argparse.Namespace, is_needed: bool) -> "SensorModel | None":
+    """Return the sensor that the user named, else where one is needed that of the source, which is told if guessed."""
+    from lidargrit.data.sources import open_source
+    from lidargrit.data.sources.scan_sensor import sensor_for
+
+    settings = scan_settings(options)
+    if not (settings.sensor or is_needed):
+        return None
+    source = open_source(options.scans, settings.data.bad_points)
+    return settings.data.imaged(sensor_for(source, settings.sensor))
 
 
 def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:
     """Do a task with every scan, and say how many points came in and went out, and how to look at them."""
-    from lidargrit.data.prepared.config import DataConfig
     from lidargrit.inference.complete.command import complete_scans
     from lidargrit.inference.complete.files import OutputConfig
 
-    output = OutputConfig(options.count, options.seed, options.format, probability)
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    output = OutputConfig(options.samples, options.seed, options.format, probability)
+    config = scan_settings(options, max_scans=options.count).data
     found = complete_scans(options.scans, options.out, model, task, output, config)
     kind = {"complete": "completed", "upsample": "upsampled", "raydrop": "dropped"}[task.verb]
     print(f"done: {counted_scans(found.scans, kind)} in {options.out}{_points(found, task)}")

@@ -1,44 +1,43 @@
 """Options that several verbs share: one wording and one meaning for each."""
 
 import argparse
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
+
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import whole_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
 
-
-def add_bad_points(parser: argparse.ArgumentParser, default: str | None = "refuse") -> None:
-    """Add ``--bad-points``."""
-    parser.add_argument(
-        "--bad-points",
-        choices=["refuse", "drop"],
-        default=default,
-        help="how to treat points that are NaN, infinite or at the origin: refuse the scan, or drop the points",
-    )
+SCANS = ("sensor", "projection", "bad_points", "bad_scans", "set")
+"""Names of the options of :func:`add_scans`."""
+_READING = "settings of reading scans, as data.columns=1024"
+_ALWAYS = ("out", "json", "overwrite", "help", "debug")  # in every mode of a verb that has several
 
 
-def add_bad_scans(parser: argparse.ArgumentParser, default: str | None = "refuse") -> None:
-    """Add ``--bad-points`` and ``--bad-scans``."""
-    add_bad_points(parser, default)
-    parser.add_argument(
-        "--bad-scans",
-        choices=["refuse", "skip"],
-        default=default,
-        help="how to treat a scan that cannot be used: stop, or skip the scan with a warning",
-    )
+def add_scans(parser: argparse.ArgumentParser, settings: str = _READING, *, projects: bool = True) -> None:
+    """Add the options of all verbs that read scans; :func:`scan_settings` or :func:`scan_words` reads them.
+
+    Args:
+        settings: words for what ``--set`` changes.
+        projects: whether scans become range images, so that their sensor matters and how rows are found.
+    """
+    add = parser.add_argument
+    if projects:
+        add("--sensor", default="", help="name or .json of the scans' sensor (else guessed)")
+        rows = {"choices": ["sensor", "spherical", "unfolding"], "metavar": "ROWS"}
+        add("--projection", help="spherical (elevation), unfolding (ring) or sensor", **rows)
+    how = {"metavar": "HOW", "default": None}
+    add("--bad-points", choices=["refuse", "drop"], help="refuse or drop points without a place (NaN, 0 0 0)", **how)
+    add("--bad-scans", choices=["refuse", "skip"], help="refuse or skip scans that cannot be used", **how)
+    add_settings(parser, settings)
 
 
-def add_scans(parser: argparse.ArgumentParser) -> None:
-    """Add the options of all verbs that read and project scans; :func:`scan_settings` reads them."""
-    sensor = "name or .json file of the sensor (default: that of the data set, the samples, the run or the protocol)"
-    parser.add_argument("--sensor", default="", help=sensor)
-    rows = "rows by elevation (spherical), by ring (unfolding), or the sensor's own (default), by elevation where "
-    rows += "points are not in firing order"
-    parser.add_argument("--projection", choices=["sensor", "spherical", "unfolding"], help=rows)
-    variant = "exact, or reference to repeat the projection of the released LidarGRIT program"
-    parser.add_argument("--projection-variant", choices=["exact", "reference"], help=variant)
-    add_bad_scans(parser, default=None)
-    add_settings(parser, "settings of reading scans, the same for all verbs, such as data.columns=1024")
+def scan_words(options: argparse.Namespace, **more: int | None) -> list[str]:
+    """Return the settings of reading scans that the user gave, as words for ``--set``; those of ``--set`` come last."""
+    given = {name: vars(options).get(name) for name in SCANS if name != "set"} | more
+    return [*(f"data.{name}={value}" for name, value in given.items() if value not in (None, "")), *options.set]
 
 
 def scan_settings(options: argparse.Namespace, **more: int | None) -> "ScanSettings":
@@ -50,13 +49,32 @@ def scan_settings(options: argparse.Namespace, **more: int | None) -> "ScanSetti
     """
     from lidargrit.data.prepared.config import ScanSettings
 
-    names = ("sensor", "projection", "projection_variant", "bad_points", "bad_scans")
-    return ScanSettings.read(options.set, **{name: vars(options).get(name) for name in names}, **more)
+    return ScanSettings.read([word for word in scan_words(options, **more) if not word.startswith("sampling.")])
 
 
 def add_settings(parser: argparse.ArgumentParser, what: str) -> None:
     """Add ``--set NAME=VALUE ...``, which changes settings of ``what``."""
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=what)
+
+
+def sampling_words(words: Sequence[str]) -> list[str]:
+    """Return the settings of sampling among those of ``--set``, without the ``sampling.`` before their names.
+
+    Raises:
+        ConfigError: a setting of nothing, without data. or sampling. before its name.
+    """
+    for word in words:
+        if not word.startswith(("sampling.", "data.")):
+            wanted = "sampling. before a setting of sampling, data. before one of reading scans"
+            raise ConfigError(f"--set {word}", wanted, f"such as --set sampling.{word}")
+    return [word.removeprefix("sampling.") for word in words if word.startswith("sampling.")]
+
+
+def add_count(
+    parser: argparse.ArgumentParser, default: int = 0, help: str = "number of scans, evenly spaced; 0 for all"
+) -> None:
+    """Add ``-n``/``--count``, the number of scans."""
+    parser.add_argument("-n", "--count", type=whole_number, default=default, metavar="N", help=help)
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
@@ -69,5 +87,24 @@ def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
 
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--device``."""
-    device = "device to compute on: cpu, cuda or cuda:1 (default: cuda if there is one)"
+    device = "cpu or cuda:1 (default: a GPU, if there is one)"
     parser.add_argument("--device", default="", help=device)
+
+
+def refuse_unused(options: argparse.Namespace, when: str, takes: Collection[str]) -> None:
+    """Refuse words that a verb does not take in one of its modes.
+
+    Args:
+        options: parsed options of the verb.
+        when: words for the mode, such as "with --tables".
+        takes: names of what it takes then.
+
+    Raises:
+        ConfigError: another option or word is given; names the first.
+    """
+    for action in options.words._actions:
+        given = getattr(options, action.dest, None)
+        if given not in (None, [], action.default) and action.dest not in (*takes, *_ALWAYS):
+            word = action.option_strings[-1] if action.option_strings else given if isinstance(given, str) else given[0]
+            cure = f"leave it out, see: {options.words.prog} --help"
+            raise ConfigError(f"{word} {when}", "only what is used then", cure)

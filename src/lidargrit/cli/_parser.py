@@ -26,6 +26,21 @@ _EXPLANATIONS = (
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """Adds its default to the help of every option that has one and does not describe it itself."""
 
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=25)  # where help of every verb takes the fewest lines
+
+    def _format_args(self, action: argparse.Action, default_metavar: str) -> str:
+        """Return what follows an option's name: WORD ... in place of argparse's WORD [WORD ...]."""
+        if action.nargs in ("+", "*"):
+            return f"{action.metavar or default_metavar} ..."
+        return super()._format_args(action, default_metavar)
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        """Return the names of an option, with what follows them once."""
+        if not action.option_strings or action.nargs == 0:
+            return super()._format_action_invocation(action)
+        return f"{', '.join(action.option_strings)} {self._format_args(action, action.dest.upper())}"
+
     def _get_help_string(self, action: argparse.Action) -> str:
         text = action.help or ""
         has_default = isinstance(action.default, (int, float, str, Path)) and not isinstance(action.default, bool)
@@ -66,6 +81,11 @@ class Parser(argparse.ArgumentParser):
         except UsageError as error:
             name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
             raise UsageError(f"{name} {error.got}", error.wanted, error.cure) from None
+
+    def short_usage(self) -> str:
+        """Return the words that a command needs, in one line; its options are listed below it."""
+        shown = [str(action.metavar or action.dest).upper() for action in self._actions if not action.option_strings]
+        return " ".join([self.prog, *shown, "[OPTION ...]"])
 
     def verbs(self) -> "list[Parser]":
         """Return the parsers of the verbs below this one."""

@@ -21,10 +21,16 @@ STANDARD_OUTPUT = Path("-")
 
 def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json") -> None:
     """Add ``--json [FILE.json]``, and ``--overwrite`` for the ``files`` that it may replace."""
-    what = "print the result as JSON; with a file name, print the table and write the JSON to the file"
+    what = "print JSON; with a file name, write it there besides"
     file = {"nargs": "?", "const": STANDARD_OUTPUT, "type": _json_file, "metavar": "FILE.json"}
     parser.add_argument("--json", help=what, **file)
-    parser.add_argument("--overwrite", action="store_true", help=f"replace {files} if already there")
+    parser.add_argument("--overwrite", action="store_true", help=f"replace {files}")
+
+
+def add_table(parser: argparse.ArgumentParser) -> None:
+    """Add ``--table``, the form of a printed table."""
+    forms = {"choices": ["text", "markdown", "latex"], "default": "text", "metavar": "FORM"}
+    parser.add_argument("--table", help="text, markdown or latex", **forms)
 
 
 def refuse_taken(options: argparse.Namespace, *others: Path) -> None:

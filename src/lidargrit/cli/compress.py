@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._options import add_count, add_scans, scan_settings
 from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
@@ -21,20 +21,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("out", type=Path, metavar="OUT.lgz", help="file to write")
     add("--model", default="pretrained", help="run with a pixel decoder (default: pretrained)")
     add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
-    add("-n", "--max-scans", type=int, default=0, help="largest number of scans, evenly spaced; 0 for all")
-    add_bad_scans(parser)
+    add_count(parser)
+    add_scans(parser)
     add("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
     """Compress the scans, and say how small they are."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.inference.compress.command import compress_scans
 
     refuse_to_overwrite(options.out, options.overwrite, ".lgz")
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.out, options.model, options.step_mm)
-    found = compress_scans(*named, config)
+    settings = scan_settings(options, max_scans=options.count)
+    refuse_other_sensor(settings.sensor, options.model)
+    found = compress_scans(*named, settings.data)
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
     print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_settings
+from lidargrit.cli._options import add_scans, scan_words
 
 EXAMPLES = """\
   lidargrit demo                                simulated streets, three to five minutes on two cores with bfloat16
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     anew = "train all networks anew (default: begin with those of the model pretrained, if it has your sensor)"
     parser.add_argument("--anew", action="store_true", help=anew)
     settings = "settings of the preset to change"
-    add_settings(parser, settings)
+    add_scans(parser, settings)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -29,5 +29,5 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.viewer.demo import PAGE, demo
 
     out = options.out or Path("runs") / (f"demo-{root_of(options.data).resolve().name}" if options.data else "demo")
-    folder = demo(options.data, out, options.set, options.anew)
+    folder = demo(options.data, out, scan_words(options), options.anew)
     print(f"done: look at {folder / PAGE}; everything lies in {folder}")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._options import add_count, add_scans, scan_settings
 from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
@@ -18,9 +18,7 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.set_defaults(goes_on=True)
-    parser.add_argument(
-        "source", help="samples, prepared scans, or scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT"
-    )
+    parser.add_argument("scans", help="samples, prepared scans, or scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument(
         "--format",
@@ -28,26 +26,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="format of the files: bin, pcd, ply, las, npz, a name from: lidargrit list formats, or kitti_odometry for "
         "a tree with SemanticKITTI's labels",
     )
-    parser.add_argument(
-        "-n", "--max-scans", type=int, default=0, help="number of scans to export, evenly spaced; 0 for all"
-    )
+    add_count(parser)
     sensor = "name or .json file of the sensor, for range images in .npy files"
     parser.add_argument("--sensor", default="", help=sensor)
     poses = "poses of the lidar, to undo its motion: a file of time x y z qx qy qz qw, or KITTI's folder of a sequence"
     parser.add_argument("--undo-motion", type=Path, metavar="POSES", help=poses)
-    add_bad_scans(parser)
+    add_scans(parser, projects=False)
 
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many."""
     from lidargrit.data.export import export_scans
-    from lidargrit.data.prepared.config import DataConfig
     from lidargrit.data.trajectories import read_trajectory
     from lidargrit.scans.motion import UndoMotion
     from lidargrit.scans.sensors import load_sensor
 
     sensor = load_sensor(options.sensor) if options.sensor else None
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
+    config = scan_settings(options, max_scans=options.count).data
     change = UndoMotion(read_trajectory(options.undo_motion)) if options.undo_motion else None
-    count = export_scans(options.source, options.out, options.format, config, sensor, change)
+    count = export_scans(options.scans, options.out, options.format, config, sensor, change)
     print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

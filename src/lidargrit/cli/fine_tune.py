@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_settings
+from lidargrit.cli._options import add_scans, scan_words
 
 EXAMPLES = """\
   lidargrit fine-tune /data/scans runs/mine --sensor os1_64
@@ -16,8 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(goes_on=True)
     parser.add_argument("scans", help="scans: a folder, or NAME:ROOT:SPLIT; some of them are held out")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
-    parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the data set)")
-    add_settings(parser, "settings of the training to change, such as training.transformer.scans=2000")
+    add_scans(parser, "settings of the training to change, such as training.transformer.scans=2000")
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, and how long it takes")
 
 
@@ -28,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.training.fine_tuning import fine_tuning_preset
 
     reporting.message("looking at the scans")
-    preset = fine_tuning_preset(options.scans, options.sensor, options.set)
+    preset = fine_tuning_preset(options.scans, options.sensor, scan_words(options))
     check_folder(options.out, preset)
     flops = training_flops(preset)
     said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in flops)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._options import add_count, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -15,13 +15,12 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("source", help="folder, data set or file of scans that one sensor made")
+    parser.add_argument("scans", help="folder, data set or file of scans that one sensor made")
     parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="sensor file to write")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also plot the fitted rows beside the points")
-    some = "number of scans to fit, evenly spaced; 0 for all"
-    parser.add_argument("-n", "--max-scans", type=int, default=20, help=some)
+    add_count(parser, 20)
     parser.add_argument("--name", help="name of the sensor (default: the name of the sensor file)")
-    add_bad_scans(parser)
+    add_scans(parser, projects=False)
     add_json(parser, "the files of --out, --picture and --json")
 
 
@@ -36,8 +35,9 @@ def run(options: argparse.Namespace) -> None:
     refuse_to_overwrite(options.picture, options.overwrite, ".png")
     refuse_taken(options, options.out)
     name = options.out.stem if options.name is None else options.name
-    dataset = open_source(options.source, options.bad_points).scans()
-    fit = fit_sensor_to_dataset(dataset, name, options.max_scans, options.bad_scans)
+    config = scan_settings(options).data
+    dataset = open_source(options.scans, config.bad_points).scans()
+    fit = fit_sensor_to_dataset(dataset, name, options.count, config.bad_scans)
     if options.picture:
         from lidargrit.viewer.sensor_fit import plot_sensor_fit
 

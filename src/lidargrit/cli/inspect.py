@@ -15,8 +15,7 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
-    parser.add_argument("scan", help="file of a scan, or a source of scans whose first scan is inspected")
-    parser.add_argument("--columns", type=int, help="number of columns of the full circle (default: the sensor's)")
+    parser.add_argument("scans", help="file of a scan, or a source of scans whose first scan is inspected")
     add_scans(parser)
     parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
     add_json(parser, "the files of --out and --json")
@@ -34,8 +33,8 @@ def run(options: argparse.Namespace) -> None:
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
     refuse_taken(options)
-    settings = scan_settings(options, columns=options.columns)
-    scan, of_data_set = first_scan(options.scan, settings.data)
+    settings = scan_settings(options)
+    scan, of_data_set = first_scan(options.scans, settings.data)
     name = settings.sensor or of_data_set or closest_sensor(scan)
     sensor, method = settings.data.imaged(load_sensor(name)), None
     if settings.data.projection == "sensor" and (method := projection_that_fits(scan, sensor)) != sensor.projection:

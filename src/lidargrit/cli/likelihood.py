@@ -1,14 +1,14 @@
-"""Measure the likelihood of scans under a model, in bits: tokens, mask and ranges."""
+"""Measure scans under a model: their likelihood in bits, and the errors of their reconstructions."""
 
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans, add_device
+from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
   lidargrit likelihood simulated:64:test
-  lidargrit likelihood /data/kitti_odometry --model runs/mine --step-mm 2 --max-scans 100
+  lidargrit likelihood /data/kitti_odometry --model runs/mine --step-mm 2 -n 100
   lidargrit likelihood /data/held_out --map bits.npy --json bits.json
 """
 
@@ -19,29 +19,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("scans", help="source of scans: a file's folder, NAME:ROOT:SPLIT, samples, or prepared scans")
     add("--model", default="pretrained", help="run whose probabilities count (default: pretrained)")
     add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
-    add("-n", "--max-scans", type=int, default=0, help="largest number of scans, evenly spaced; 0 for all")
+    add_count(parser)
     add(
         "--map",
         type=Path,
         metavar="FILE.npy",
         help="also write the bits of every pixel: float32 (scans, rows, columns)",
     )
-    add_bad_scans(parser)
+    add_scans(parser)
     add_device(parser)
     add_json(parser, "the files of --json and --map")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Count the bits and print a table."""
+    """Measure, and print the tables."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.evaluation.likelihood import likelihood_of_source
+    from lidargrit.data.sources.scan_sensor import refuse_other_sensor
+    from lidargrit.evaluation.likelihood import measure_source
 
     refuse_taken(options)
     if options.map is not None:
         refuse_to_overwrite(options.map, options.overwrite, ".npy")
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.model, options.step_mm)
-    found = likelihood_of_source(*named, config, options.map, options.device)
-    result = {"model": options.model, "source": options.scans, **found.as_json()}
-    print_result(options, found.as_table(), result)
+    settings = scan_settings(options, max_scans=options.count)
+    refuse_other_sensor(settings.sensor, options.model)
+    print_result(options, *measure_source(*named, settings.data, options.map, options.device))

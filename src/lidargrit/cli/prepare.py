@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from lidargrit.cli._options import add_rank, add_scans, scan_settings
+from lidargrit.cli._options import add_count, add_rank, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -18,13 +18,10 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.set_defaults(goes_on=True)
-    parser.add_argument("source", help="scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
+    parser.add_argument("scans", help="scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     out = "folder for the range images, a source for train and evaluate (default: in the cache)"
     parser.add_argument("-o", "--out", type=Path, help=out)
-    columns = "number of columns of the full circle (default: the sensor's)"
-    parser.add_argument("--columns", type=int, help=columns)
-    parser.add_argument("--column-stride", type=int, help="keep every n-th of the columns")
-    parser.add_argument("-n", "--max-scans", type=int, help="number of scans, evenly spaced; 0 for all (default)")
+    add_count(parser)
     add_scans(parser)
     parser.add_argument("--workers", type=int, help="number of processes on this machine (default: 2)")
     add_rank(parser, "machine")
@@ -38,10 +35,10 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.data.sources import open_source
 
     refuse_taken(options)
-    names = ("columns", "column_stride", "max_scans", "workers")
-    settings = scan_settings(options, **{name: vars(options)[name] for name in names})
-    dataset = open_source(options.source, settings.data.bad_points).scans()
-    config = replace(settings.data, sensor=settings.sensor or dataset.sensor)
-    machines = options.rank, options.world_size
-    made = prepare_and_describe(options.source, dataset, config, options.out, *machines, options.verify)
+    machines = (options.rank, options.world_size)
+    settings = scan_settings(options, max_scans=options.count, workers=options.workers)
+    source = open_source(options.scans, settings.data.bad_points)
+    dataset = source.scans()
+    config = replace(settings.data, sensor=settings.sensor or source.sensor_name)
+    made = prepare_and_describe(options.scans, dataset, config, options.out, *machines, options.verify)
     print_result(options, made.as_text(), made.to_json())

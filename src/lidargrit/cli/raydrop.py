@@ -2,12 +2,12 @@
 
 import argparse
 
-from lidargrit.cli._completion import add_completion, open_model_for, run_task
+from lidargrit.cli._completion import add_completion, named_sensor, open_model_for, run_task
 
 EXAMPLES = """\
   lidargrit raydrop /data/carla_scans dropped
   lidargrit raydrop clean.npy dropped --format image --probability 32      a range image, and P(return)
-  lidargrit raydrop /data/carla_scans dropped -n 4 --seed 100              each scan in four ways
+  lidargrit raydrop /data/carla_scans dropped --samples 4 --seed 100       each scan in four ways
 """
 
 
@@ -23,4 +23,4 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.inference.complete.tasks import Drop
 
     task = Drop()
-    run_task(options, open_model_for(options, task, None), task, options.probability)
+    run_task(options, open_model_for(options, task, named_sensor(options, is_needed=False)), task, options.probability)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans
+from lidargrit.cli._options import add_count, add_scans, scan_settings
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import signed_number
 
@@ -19,28 +19,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument("--to", required=True, help="name or .json file of the sensor whose scans are wanted")
-    parser.add_argument("--sensor", default="", help="sensor that made the scans (default: that of the source)")
     raised = "height of the wanted sensor above the one that made the scans, in metres"
     parser.add_argument("--raised-m", type=signed_number, default=0.0, help=raised)
     formats = "format of the files: bin, pcd, ply, las, npz, or kitti_odometry for a tree with labels"
     parser.add_argument("--format", default="kitti_bin", help=formats)
-    parser.add_argument("-n", "--max-scans", type=int, default=0, help="number of scans, evenly spaced; 0 for all")
-    add_bad_scans(parser)
+    add_count(parser)
+    add_scans(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Write the files, and say how many rays of the wanted sensor get a point."""
     from lidargrit.data.export import export_scans
-    from lidargrit.data.prepared.config import DataConfig
     from lidargrit.data.sources import open_source
+    from lidargrit.data.sources.scan_sensor import sensor_for
     from lidargrit.scans.rescan import Rescan
     from lidargrit.scans.sensors import load_sensor
 
     other = load_sensor(options.to)
-    source = open_source(options.scans, options.bad_points)
-    sensor = load_sensor(options.sensor) if options.sensor else source.sensor
-    change = Rescan(sensor, other, options.raised_m)
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
-    count = export_scans(options.scans, options.out, options.format, config, change=change)
+    settings = scan_settings(options, max_scans=options.count)
+    source = open_source(options.scans, settings.data.bad_points)
+    change = Rescan(sensor_for(source, settings.sensor), other, options.raised_m)
+    count = export_scans(options.scans, options.out, options.format, settings.data, change=change)
     look = f"lidargrit view {options.out} --sensor {options.to}"
     print(f"done: {counted_scans(count)} in {options.out}; look at them: {look}")

@@ -4,7 +4,7 @@ import argparse
 import os
 from pathlib import Path
 
-from lidargrit.cli._options import add_device, add_rank, add_settings
+from lidargrit.cli._options import add_device, add_rank, add_settings, sampling_words
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row
 
@@ -12,8 +12,8 @@ EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
   lidargrit sample pretrained_wide samples -n 8           by another, 64x1024
   lidargrit sample runs/demo samples -n 100
-  lidargrit sample runs/demo bolder -n 100 --set temperature=1.1 mask=threshold
-  lidargrit sample runs/demo as_released -n 100 --set top_k=100
+  lidargrit sample runs/demo bolder -n 100 --set sampling.temperature=1.1 sampling.mask=threshold
+  lidargrit sample runs/demo as_released -n 100 --set sampling.top_k=100
   torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
 
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
-    add_settings(parser, "sampling settings to change, such as temperature=1.1; see: lidargrit list generators")
+    add_settings(parser, "settings of sampling, such as sampling.temperature=1.1; see: lidargrit list generators")
     add_rank(parser, "process")
     add_device(parser)
 
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     device = usable_device(options.device or own)
     run_folder = locate(options.run_folder)
     generator = load(run_folder).to(device)
-    sampling = generator.parse_sampling(options.set)
+    sampling = generator.parse_sampling(sampling_words(options.set))
     seeds = seeds[rank::world_size]
     write_samples(generator, run_folder, options.out, seeds, sampling)
     print(f"done: {counted_scans(len(seeds))} in {options.out}; look at them with: lidargrit view {options.out}")

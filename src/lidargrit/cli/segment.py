@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_bad_scans, add_device
+from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.core.errors import counted_scans
 
@@ -22,23 +22,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
     add("out", type=Path, help="folder for the tree: empty, or begun by the same command")
     add("--model", default="pretrained", help="segmenter's run (default: pretrained)")
-    add("-n", "--max-scans", type=int, default=0, help="number of scans to take, evenly spaced; 0 for all")
+    add_count(parser)
     compare = "also compare with the scans' own labels of this numbering: semantic_kitti, pandaset or nuscenes"
     add("--compare", default="", metavar="NUMBERING", help=compare)
-    add_bad_scans(parser)
+    add_scans(parser)
     add_device(parser)
     add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Label the scans, and say where they are."""
-    from lidargrit.data.prepared.config import DataConfig
+    from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.inference.segment.command import segment_scans
 
     refuse_taken(options)
-    config = DataConfig(max_scans=options.max_scans, bad_points=options.bad_points, bad_scans=options.bad_scans)
     named = (options.scans, options.out, options.model)
-    count, scores = segment_scans(*named, config, options.device, options.compare)
+    settings = scan_settings(options, max_scans=options.count)
+    refuse_other_sensor(settings.sensor, options.model, "segment")
+    count, scores = segment_scans(*named, settings.data, options.device, options.compare)
     found = scores.as_json() if scores else {}
     done = f"done: {counted_scans(count, 'labelled')} in {options.out}; see them with: lidargrit view {options.out}"
     result = {"source": options.scans, "model": options.model, "scans": count, **found}

@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("out", type=Path, help="folder for the scans: empty, or begun by the same command")
-    parser.add_argument("-n", "--num-scans", type=int, required=True, help="number of scans in all")
+    parser.add_argument("-n", "--count", type=int, required=True, help="number of scans in all")
     parser.add_argument("--sensor", default=_SENSOR, help="name or .json file of the sensor")
     parser.add_argument(
         "--seed", type=seed_number, default=0, help="seed of the first street; each next street has the next seed"
@@ -52,6 +52,6 @@ def run(options: argparse.Namespace) -> None:
         wet=options.wet,
         clean=options.clean,
     )
-    there = write_drives(options.out, options.num_scans, config, options.workers)
+    there = write_drives(options.out, options.count, config, options.workers)
     theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
     print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_settings
+from lidargrit.cli._options import add_scans, scan_words
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("preset", help="name of a preset; see: lidargrit list presets")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
     settings = "settings of the preset to change, such as data.train=/data/scans; see all with --dry-run"
-    add_settings(parser, settings)
+    add_scans(parser, settings)
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, with every setting, and stop")
     measuring = "like --dry-run, and take a few steps to estimate operations, time and memory"
     tracking = "also log to this project of Weights & Biases (pip install 'lidargrit[wandb]')"
@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.generation.presets import load_preset
     from lidargrit.training import measure, open_data, plan_training, train
 
-    preset = load_preset(options.preset, options.set)
+    preset = load_preset(options.preset, scan_words(options))
     if options.dry_run or options.measure:
         refuse_taken(options)
         planned, measured = plan_training(preset), measure(preset) if options.measure else []

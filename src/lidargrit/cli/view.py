@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_device, add_scans, scan_settings
+from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
 from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
@@ -17,12 +17,12 @@ EXAMPLES = """\
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Name the options."""
     parser.add_argument(
-        "places", nargs="+", metavar="PATH", help="run, folder of samples, file of a scan, or source of scans"
+        "scans", nargs="+", metavar="SCANS", help="source of scans: a file, a folder, samples, or a run"
     )
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("view.png"), help="picture (.png) or interactive page (.html) to write"
     )
-    parser.add_argument("-n", "--count", type=int, default=3, help="number of scans of each")
+    add_count(parser, 3, help="number of scans of each")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first generated scan")
     colour = "colour of pixels: range, or surprise for the bits beyond those expected"
     parser.add_argument("--color", choices=["range", "surprise"], default="range", help=colour)
@@ -44,6 +44,6 @@ def run(options: argparse.Namespace) -> None:
             f"--model {options.model} with --color range", "--color surprise", "add it, or leave --model out"
         )
     refuse_to_overwrite(options.out, options.overwrite, ".png", ".html")
-    named = (options.places, options.out, options.count, options.seed, scan_settings(options))
+    named = (options.scans, options.out, options.count, options.seed, scan_settings(options))
     view(*named, (options.model or "pretrained") if options.color == "surprise" else "", options.device)
     print(f"done: look at {options.out}")

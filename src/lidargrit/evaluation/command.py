@@ -1,7 +1,6 @@
-"""Two names and a configuration → scores or errors of reconstruction: what ``lidargrit evaluate`` does."""
+"""Two names and a configuration → scores: what ``lidargrit evaluate`` does."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,18 +8,18 @@ from typing import Any
 from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, nearest_names, one_of
 from lidargrit.core.files import refuse_to_overwrite
+from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
-from lidargrit.data.sources import RunSource, SampleSource, Source, TensorSource, open_source
+from lidargrit.data.sources import DatasetSource, RunSource, SampleSource, Source, TensorSource, open_source
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair
-from lidargrit.evaluation.protocols import DEFAULT, public_name
-from lidargrit.evaluation.reconstruction import score_run
+from lidargrit.evaluation.protocols import public_name
+from lidargrit.evaluation.raydrop import raydrop_json, raydrop_model, raydrop_table, scores_of_model
+from lidargrit.evaluation.realism import CurveScore, as_json, as_table, compare, scans_of_both
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.nn.devices import usable_device
-
-_OF_TABLES = ("tables", "format", "json", "overwrite", "debug", "verb")  # options that printing takes as well
 
 
 def evaluate(
@@ -31,13 +30,13 @@ def evaluate(
     write_report: Callable[[Scorecard, EvalPair, Path], None] | None = None,
     overwrite: bool = False,
 ) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
-    """Score samples against a reference, or measure the reconstructions of a run.
+    """Score samples against a reference.
 
     Args:
-        samples: name of the first set: samples, any source of scans, or a finished run.
+        samples: name of the first set: samples, or any source of scans.
         reference: name of the second set.
         config: metrics, protocol and projection of the comparison.
-        report: file for a report; a run has none.
+        report: file for a report.
         write_report: function that writes the report.
         overwrite: whether a report that is there already is replaced.
 
@@ -56,8 +55,11 @@ def evaluate(
     first = open_source(samples, config.data.bad_points, config.samples_format)
     second = open_source(reference, config.data.bad_points)
     if isinstance(first, RunSource):
-        _refuse_options_of_samples(samples, config, report)
-        return *_reconstruction(first, second, config), None
+        raise ConfigError(
+            f"the run {samples}, which holds no scans",
+            "its samples, or scans to measure under it",
+            f"lidargrit sample {samples} FOLDER, or lidargrit likelihood {reference} --model {samples}",
+        )
     _refuse_unused(first, config)
     pair = open_pair(first, second, config)
     card = compare_pair(pair, config)
@@ -67,23 +69,42 @@ def evaluate(
     return card.as_table(), card.to_json(), also
 
 
-def check_modes(options: Mapping[str, Any], default_of: Callable[[str], Any]) -> None:
-    """Refuse words for scoring beside ``--tables``, which only prints, and a format of tables without it.
+def streets_of(samples: str, config: EvalConfig) -> Streets | None:
+    """Return the simulated streets that the protocol ``streets`` scores; None for other samples and protocols."""
+    if public_name(config.protocol) != "streets" or not samples.startswith("simulated"):
+        return None
+    source = open_source(samples, config.data.bad_points)
+    streets = source.scans() if isinstance(source, DatasetSource) else None
+    return streets if isinstance(streets, Streets) else None
+
+
+def evaluate_streets(
+    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str
+) -> tuple[str, dict[str, Any], list[CurveScore]]:
+    """Compare simulated streets, and independent drops of their clean scans, with real scans.
 
     Args:
-        options: values of all options, by their names.
-        default_of: function that returns the default of an option.
+        samples: name of the streets.
+        streets: streets of this name, by :func:`streets_of`.
+        reference: source of real scans.
+        model: run that drops returns of clean scans, which is compared too; none if empty.
+
+    Returns:
+        tables, their plain values, and the curves, which can be plotted.
 
     Raises:
-        ConfigError: they are mixed.
+        ConfigError: a model that drops no returns, or scans of another sensor.
+        DataError: fewer than two real scans.
     """
-    of_scoring = [name for name, value in options.items() if name not in _OF_TABLES and value != default_of(name)]
-    if options["tables"] and of_scoring:
-        got = f"--tables and {options['samples'] or '--' + of_scoring[0].replace('_', '-')}"
-        raise ConfigError(got, "files of scores to print, or sets to score", "run the two one after the other")
-    if options["format"] != "text" and not options["tables"]:
-        cure = "score with --json FILE.json, then print it with --tables FILE.json"
-        raise ConfigError(f"--format {options['format']} without --tables", "files of scores to print", cure)
+    drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
+    simulated, real = scans_of_both(
+        streets, open_source(reference, config.data.bad_points), config.sensor, config.data_config()
+    )
+    of_model = scores_of_model(drops, simulated, real) if drops else []
+    scores = compare(simulated, real)
+    text = "\n\n".join([as_table(scores), *([raydrop_table(of_model)] if drops else [])])
+    about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
+    return text, {**about, "curves": as_json(scores), "raydrop": raydrop_json(of_model)}, scores
 
 
 def read_config(
@@ -136,28 +157,6 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def _refuse_options_of_samples(run: str, config: EvalConfig, report: Path | None) -> None:
-    """Refuse options of scoring samples, which have no meaning for the reconstructions of a run."""
-    given = {
-        "--report": report is not None,
-        "--metrics": bool(config.metrics),
-        "--variant": bool(config.variant),
-        "--protocol": public_name(config.protocol) != DEFAULT,
-        "--weights": bool(config.weights),
-        "--pixel-statistics": config.pixel_statistics,
-        "--sensor": bool(config.sensor),
-        "--set data.columns or data.column_stride": _has_columns(config),
-        "--intervals or --groups": replace(config.resampling, seed=0) != Resampling(),
-        "--seed": config.resampling.seed != 0,
-    }
-    if wrong := [option for option, is_given in given.items() if is_given]:
-        raise ConfigError(
-            f"{wrong[0]} for the run {run}, of which only reconstructions are measured",
-            "samples, or a run without this option",
-            f"generate samples first with: lidargrit sample {run} FOLDER",
-        )
-
-
 def _has_columns(config: EvalConfig) -> bool:
     """Return whether columns are chosen, which only scans that are still to be projected can have."""
     default = DataConfig()
@@ -186,12 +185,3 @@ def _refuse_unused(samples: Source, config: EvalConfig) -> None:
             f"weights of {one_of(sorted(needed - {''}))}" if needed - {""} else "no weights",
             "leave it out, or choose a metric or protocol that needs it",
         )
-
-
-def _reconstruction(run: RunSource, reference: Source, config: EvalConfig) -> tuple[str, dict[str, Any]]:
-    variant = config.projection_variant or run.projection_variant(config.data) or "exact"
-    data = replace(config.data, max_scans=config.max_scans, projection_variant=variant)
-    errors = score_run(run, reference, data, config.device)
-    about = {"samples": run.text, "reference": reference.text, "projection_variant": variant}
-    table = "\n".join(f"{name:<22}{value:>10.4g}" for name, value in errors.items())
-    return table, {**about, "reconstruction": errors}

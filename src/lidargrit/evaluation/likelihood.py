@@ -1,4 +1,4 @@
-"""Likelihood of scans under a model: range images → bits with intervals, and maps of bits."""
+"""Scans under a model: range images → bits with intervals, maps of bits, and errors of reconstruction."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -18,6 +18,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import DatasetSource, RunSource, open_source, overlap
 from lidargrit.evaluation.estimates import Estimate
 from lidargrit.evaluation.pairs import EvalSet
+from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.bits import ScanBits
@@ -59,16 +60,6 @@ class Likelihood:
         return {
             part: {unit: Estimate.of_ratio(bits, count) for unit, count in counts.items()}
             for part, bits in parts.items()
-        }
-
-    def by_natural_unit(self) -> dict[str, float]:
-        """Return the bits of tokens and mask per pixel, and of ranges per return, by names that end in the unit."""
-        found = self.estimates()
-        units = {"tokens": ("token", "pixel"), "mask": ("mask", "pixel"), "range": ("range", "return")}
-        return {
-            f"{name}_bits_per_{unit}": found[part][unit].value
-            for part, (name, unit) in units.items()
-            if part in self.parts
         }
 
     def as_json(self) -> dict[str, Any]:
@@ -169,34 +160,49 @@ def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[BinaryIO | 
         yield file
 
 
-def likelihood_of_source(
+def measure_source(
     text: str,
     model: str,
     step_mm: int,
     config: DataConfig,
     maps: Path | None = None,
     device: str = "",
-) -> Likelihood:
-    """Return the bits of the scans of a source by a finished run.
+) -> tuple[str, dict[str, Any]]:
+    """Measure the scans of a source by a finished run: their bits, and the errors of their reconstructions.
 
     Args:
         text: source of scans.
         model: finished run; scans are projected with its sensor, in the way of its training.
         maps: file to write the bits of every pixel to; none if not given.
 
+    Returns:
+        tables for people, and the same as plain values: bits of a model that has probabilities, errors of one with
+        tokens.
+
     Raises:
-        ConfigError: a model without probabilities, or a step that is not one.
+        ConfigError: a model with neither, or without probabilities where a file of bits is wanted; a step that is none.
         DataError: no usable scan, or scans of another sensor.
     """
     run = RunSource(model, locate(model))
     variant = run.projection_variant(config) or config.projection_variant
     config = replace(config, projection_variant=variant)
     generator = load(run.folder).to(usable_device(device))
+    has_tokens = "tokens" in generator.capabilities
     source = open_source(text, config.bad_points)
     images = source.images(run.sensor, config)
     if isinstance(source, DatasetSource):
         with suppress(ScanError):  # of a first scan that was left out, and told of
             reporting.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))
     if shared := overlap(run, None, images):
-        reporting.message(f"WARNING: {run.text} has learned from some of these scans ({shared}): they take fewer bits")
-    return score_likelihood(generator, images, step_mm, maps)
+        reporting.message(
+            f"WARNING: {run.text} has learned from some of these scans ({shared}): the figures flatter it"
+        )
+    tables: list[str] = []
+    values: dict[str, Any] = {"model": model, "source": text, "projection_variant": variant}
+    if "likelihood" in generator.capabilities or maps is not None or not has_tokens:  # else refused, with what it lacks
+        found = score_likelihood(generator, images, step_mm, maps)
+        tables, values = [found.as_table()], {**values, **found.as_json()}
+    if has_tokens:
+        errors = score_reconstruction(generator.get_tokenizer(), images)
+        tables, values = [*tables, errors.as_table()], {**values, "reconstruction": asdict(errors)}
+    return "\n\n".join(tables), values

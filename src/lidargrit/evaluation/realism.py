@@ -8,10 +8,12 @@ import numpy as np
 import torch
 
 from lidargrit.core import reporting
+from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
+from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import open_source
+from lidargrit.data.sources.source import Source
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -124,36 +126,34 @@ def drop_independently(clean: RangeImage, return_share: float) -> RangeImage:
 
 
 def scans_of_both(
-    source: str,
-    count: int,
-    sensor: str = "",
-    fine: bool = False,
-    seed: int = 0,
-    config: DataConfig | None = None,
+    streets: Streets, source: Source, sensor: str, config: DataConfig
 ) -> tuple[SimulatedScans, RangeImages]:
     """Simulate scans, and open the real scans that they are compared with.
 
     Args:
-        count: number of simulated scans, and largest number of real ones, which are evenly spaced.
-        sensor: name or ``.json`` file of the sensor; the data set's own if empty.
-        fine: whether all columns that the sensor fires are taken; otherwise those that its image keeps.
-        seed: seed of the first simulated scan.
+        streets: streets that are scanned with the sensor of the real scans.
+        source: source of real scans.
+        sensor: name or ``.json`` file of the sensor; the source's own if empty.
+        config: columns and projection of both, and their largest number; at most as many real scans as streets.
+
+    Raises:
+        ConfigError: fewer than two streets, or streets of another sensor.
+        DataError: fewer than two real scans.
     """
-    if count < 2 or seed < 0:
-        got = f"{counted_scans(count)} from seed {seed}"
-        raise ConfigError(got, "at least 2, and no negative seed", "correct the number")
-    config = config or DataConfig()
-    scans = open_source(source, config.bad_points)
-    firing = load_sensor(sensor) if sensor else scans.sensor
-    rays = config.imaged(firing)
-    rays = rays.fine() if fine else rays
-    real = scans.images(rays, replace(config, max_scans=min(count, config.max_scans or count)))
+    seeds = [streets.seeds[index] for index in evenly_spaced(config.max_scans or len(streets), len(streets))]
+    if len(seeds) < 2:
+        got = f"{len(seeds)} simulated scan"
+        raise ConfigError(got, "at least 2", "name more, as simulated:32:test, and no -n 1")
+    firing = load_sensor(sensor) if sensor else source.sensor
+    if "@" in str(streets.root) and not streets.made_by.same_rays(firing):
+        got = f"streets of {streets.made_by.name!r} and scans of {firing.name!r}"
+        raise ConfigError(got, "one sensor", "leave @SENSOR out: streets are scanned as the scans were")
+    real = source.images(config.imaged(firing), replace(config, max_scans=len(seeds)))
     _require_two(real)
-    rays = real.sensor
     pairs = []
-    with reporting.progress("simulating", count) as progress:
-        for each in range(seed, seed + count):
-            pairs.append(simulate_pair(each, rays, firing))
+    with reporting.progress("simulating", len(seeds)) as progress:
+        for seed in seeds:
+            pairs.append(simulate_pair(seed, real.sensor, firing))
             progress.advance(1)
     clean, measured = (RangeImage.stack(list(images)) for images in zip(*pairs, strict=True))
     return SimulatedScans(clean, measured), real

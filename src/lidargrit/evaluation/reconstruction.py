@@ -6,13 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, ScanError
 from lidargrit.data.images import RangeImages
-from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import RunSource, Source, overlap
-from lidargrit.evaluation.likelihood import score_likelihood
-from lidargrit.generation.generator import load
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.scans.types import RangeImage
 
@@ -118,6 +113,11 @@ class ReconstructionErrors:
     accuracy_1_25: float
     num_scans: int
 
+    def as_table(self) -> str:
+        """Return a line for each error."""
+        lines = [f"{name:<22}{value:>10.4g}" for name, value in asdict(self).items()]
+        return "\n".join(["errors of reconstruction", *lines])
+
 
 class ReconstructionScore:
     """Gathers the errors of pairs batch by batch; the result does not depend on how they were batched or ordered."""
@@ -214,24 +214,3 @@ def score_reconstruction(tokenizer: Tokenizer, images: RangeImages) -> Reconstru
         clean = tokenizer.decode(tokenizer.encode(batch.to(device)))
         score.update(batch, clean.range_m.cpu(), clean.return_logits.cpu() >= 0)
     return score.compute()
-
-
-def score_run(run: RunSource, source: Source, config: DataConfig, device: str = "cpu") -> dict[str, float]:
-    """Return how well the tokenizer of a finished run reconstructs scans, by the name of each error.
-
-    Args:
-        run: finished run.
-        source: scans that the tokenizer encodes and decodes.
-
-    Raises:
-        ConfigError: a run whose generator has no tokenizer.
-    """
-    generator = load(run.folder).to(device)
-    tokenizer = generator.get_tokenizer()
-    images = source.images(run.sensor, config)
-    if shared := overlap(run, None, images):
-        reporting.message(f"WARNING: {run.text} and the reference overlap ({shared}): the scores flatter it")
-    errors = asdict(score_reconstruction(tokenizer, images))
-    if "likelihood" not in generator.capabilities:
-        return errors
-    return {**errors, **score_likelihood(generator, images).by_natural_unit()}

@@ -1,7 +1,7 @@
-"""A table of the paper, a folder of scans → its systems prepared, trained, sampled, scored; goes on where stopped."""
+"""A table of the paper and a folder of scans → its systems, what they have in common, and what they cost."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,12 +9,10 @@ from typing import Any
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
-from lidargrit.evaluation.benchmark import Benchmark, as_table
-from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.benchmark import Benchmark
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.evaluation.tables import Format
 from lidargrit.training import computing_time, plan_training
 
 SIMULATED = "simulated"  # in place of a root
@@ -133,6 +131,11 @@ class Reproduction:
         """Return the preset of each row."""
         return {row: presets[self.small] for row, presets in self.table.rows.items()}
 
+    def remarks(self) -> list[str]:
+        """Return which preset measures which row, and what a reader of the rows must know."""
+        rows = [f"the paper's row {row!r} is measured by {system}" for row, system in self.systems().items()]
+        return [*rows, *self.table.remarks]
+
     def benchmark(self) -> Benchmark:
         """Return what all rows have in common."""
         protocol = load_protocol(self.table.protocol)
@@ -159,29 +162,21 @@ class Reproduction:
         return f"{self.table.data_set}:{self.root}:{split}"
 
 
-def reproduce(wanted: Reproduction, folder: Path) -> list[Path]:
-    """Prepare, train, sample and score every row, and return the files of scores.
-
-    Args:
-        wanted: the table and its data.
-        folder: output folder, as in :func:`lidargrit.evaluation.benchmark.run`. The same call continues there:
-            prepared scans (in the cache), checkpoints, samples and scores are not made again.
+def prepare(benchmark: Benchmark, systems: Sequence[str]) -> None:
+    """Project all training scans before anything is trained: one that cannot be used is refused now, not after days.
 
     Raises:
         DataError: the root does not hold the data set, or a split of it.
+        ConfigError: a setting that a system cannot follow.
     """
-    benchmark, systems = wanted.benchmark(), wanted.systems()
-    _prepare(benchmark, list(systems.values()))
-    return run_benchmark(list(systems.values()), folder, benchmark)
-
-
-def table_of(wanted: Reproduction, scores: list[Path], form: Format = "text") -> str:
-    """Return the scores side by side, the paper's rows apart, and which row is which."""
-    return as_table(scores, form, _remarks(wanted))
+    open_source(benchmark.reference)  # refuses a split that is not there
+    for data in [benchmark.preset(system).data for system in systems]:
+        load_range_images(data.train, data)
+        load_range_images(data.val, data)
 
 
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
-    """Return the steps of :func:`reproduce` and their costs, as plain values."""
+    """Return the steps of a reproduction and their costs, as plain values."""
     benchmark = wanted.benchmark()
     presets = {system: benchmark.preset(system) for system in wanted.systems().values()}
     data = next(iter(presets.values())).data
@@ -210,18 +205,4 @@ def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:
                 f"  {stage['name']}: {stage['scans']:,} scans, {computing_time(stage['flops'], stage['precision'])}"
             )
         lines.append(f"  sample {facts['samples']:,} scans: {of['sampling_flops']:.2g} floating-point operations")
-    return "\n".join([*lines, "", *_remarks(wanted)])
-
-
-def _prepare(benchmark: Benchmark, systems: list[str]) -> None:
-    """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
-    open_source(benchmark.reference)  # refuses a split that is not there
-    for data in [benchmark.preset(system).data for system in systems]:
-        load_range_images(data.train, data)
-        load_range_images(data.val, data)
-
-
-def _remarks(wanted: Reproduction) -> list[str]:
-    """Return a legend of the rows, and remarks that a reader must know."""
-    rows = [f"the paper's row {row!r} is measured by {system}" for row, system in wanted.systems().items()]
-    return [*rows, *wanted.table.remarks]
+    return "\n".join([*lines, "", *wanted.remarks()])

@@ -6,6 +6,7 @@ from typing import Any
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json, write_json
+from lidargrit.data.prepared.config import DataConfig
 from lidargrit.evaluation.benchmark import Benchmark, as_json
 from lidargrit.evaluation.comparison import EvalConfig
 
@@ -37,10 +38,12 @@ def read_table(folder: Path) -> tuple[list[str], Benchmark]:
     try:
         data = read_json(folder / TABLE)
         systems, settings = [str(system) for system in data["systems"]], data["settings"]
+        how = {"projection": "sensor", **settings["evaluation"]}  # which names only another one
+        reading = DataConfig(**{name: how[name] for name in ("projection", "bad_points", "bad_scans")})
         benchmark = Benchmark(
             str(settings["reference"]),
             int(settings["num_samples"]),
-            EvalConfig(protocol=str(settings["protocol"]), metrics=tuple(map(str, settings["metrics"]))),
+            EvalConfig(str(settings["protocol"]), tuple(map(str, settings["metrics"])), data=reading),
             tuple(map(str, settings["preset_settings"])),
             float(settings["flops"]),
         )

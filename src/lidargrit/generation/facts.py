@@ -60,7 +60,10 @@ class SystemFacts:
             not_of_sampling: names of those settings that only completing or inverting a scan reads.
         """
         origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
-        settings = {"sample --set": sampling.keys() - {*not_of_sampling}, "complete --set besides": {*not_of_sampling}}
+        settings = {
+            "sample --set sampling.NAME": sampling.keys() - {*not_of_sampling},
+            "complete --set sampling.NAME besides": {*not_of_sampling},
+        }
         return [
             f"generates {self.generates}",
             *(f"can {what} ({name})" for name, what in CAPABILITIES.items() if name in capabilities),

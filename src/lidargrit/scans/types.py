@@ -142,7 +142,7 @@ class Scan:
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
                 wanted,
-                "remove these points, or drop them by --set data.bad_points=drop (train) or --bad-points drop",
+                "remove these points, or drop them by --bad-points drop (in Python: bad_points='drop')",
             )
 
     def __len__(self) -> int:

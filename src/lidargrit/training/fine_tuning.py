@@ -29,7 +29,8 @@ def divided(data: str, max_scans: int = 0) -> DataConfig:
     Args:
         data: name of a data set, or of a folder of scans.
     """
-    dataset = open_source(data).scans()
+    opened = open_source(data)
+    dataset = opened.scans()
     if len(dataset) < 4:
         raise DataError(f"{counted_scans(len(dataset))} in {data}", "at least 4, to hold one out", "add scans")
     source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
@@ -49,7 +50,7 @@ def divided(data: str, max_scans: int = 0) -> DataConfig:
             "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
         )
         train, val = f"{source}:{split}[:85%]", f"{source}:{split}[85%:]"
-    return DataConfig(train=(train,), val=(val,), sensor=dataset.sensor, max_scans=max_scans)
+    return DataConfig(train=(train,), val=(val,), sensor=opened.sensor_name, max_scans=max_scans)
 
 
 def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()) -> Preset:

@@ -1,7 +1,8 @@
 """PLY files, text or binary of either byte order ⇄ :class:`Scan`."""
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,12 +48,15 @@ _TYPES = {
 _TYPE_NAMES = {kind: name for name, kind in reversed(_TYPES.items())}  # of what is written: char before int8
 
 
+_OF_CARLA = re.compile(rb"property float32 (I|CosAngle)\s")  # of its LiDAR and its semantic LiDAR
+
+
 class Ply(ScanFormat):
     """Polygon files, of which only the vertices are read.
 
     Properties are found by their names, with or without the "scalar_" that CloudCompare puts before them: x, y, z, and
     if they are there reflectance (or reflectivity, intensity, remission, i), ring (or channel) and label. Written files
-    are binary, little-endian.
+    are binary, little-endian. Files that CARLA saves, which name ``float32 I``, are left-handed and mirrored back.
 
     Source:
         Turk, The PLY Polygon File Format, 1994; the names of types of fixed size are of later programs.
@@ -83,7 +87,8 @@ class Ply(ScanFormat):
             if isinstance(error, ScanError):
                 raise
             raise _refused(first_words(error), path) from None
-        return scan_of_columns(columns, path, bad_points)
+        scan = scan_of_columns(columns, path, bad_points)
+        return _right_handed(scan) if _OF_CARLA.search(data[: header.end]) else scan
 
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
@@ -100,6 +105,13 @@ class Ply(ScanFormat):
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
         with atomic_path(path) as temporary:
             temporary.write_bytes("\n".join(header).encode() + rows.tobytes())
+
+
+def _right_handed(scan: Scan) -> Scan:
+    """Return a scan of CARLA, whose y points to the right, with y to the left."""
+    points = scan.points_xyz_m * scan.points_xyz_m.new_tensor([1.0, -1.0, 1.0])
+    note = "files of CARLA, left-handed (y to the right), are read with y to the left"
+    return replace(scan, points_xyz_m=points, notes=(*scan.notes, note))
 
 
 def _little_endian(values: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from lidargrit.core.configuration import override
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.formats import BadPoints
 from lidargrit.scans.projection import ProjectionVariant
-from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import ProjectionOption, SensorModel, load_sensor
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class DataConfig:
     sensor: str = "hdl64e_kitti_odometry"
     columns: int = 0
     column_stride: int = 1
-    projection: Literal["sensor", "spherical", "unfolding"] = "sensor"
+    projection: ProjectionOption = "sensor"
     projection_variant: ProjectionVariant = "exact"
     condition: str = "nothing"
     max_scans: int = 0

@@ -304,7 +304,7 @@ class PreparedImages:
             raise DataError(
                 f"{location}, prepared by the projection {projections[0]}",
                 projections[1],
-                "choose it where the command lets you (data.projection, data.projection_variant), or prepare anew",
+                "choose it (--projection, --set data.projection_variant), or prepare anew",
             )
         return FewerColumns(self, prepared.width, wanted.width) if is_wider else self
 

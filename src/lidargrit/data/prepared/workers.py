@@ -74,7 +74,7 @@ def make_shard(
             image = project(scan, sensor, variant="reference" if spec.variant == "reference" else "exact")
         except ScanError as error:
             if spec.bad_scans == "refuse":
-                leave_out = "leave such scans out by --set data.bad_scans=skip (train) or --bad-scans skip"
+                leave_out = "leave such scans out by --bad-scans skip"
                 raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
             writer.leave_out(index, str(error))
         else:

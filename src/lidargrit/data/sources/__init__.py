@@ -1,11 +1,13 @@
 """Sources of scans, by what a user types → one object with the kind, the data and the provenance of the source."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import DataError, LidarGritError
+from lidargrit.core.errors import DataError, LidarGritError, ScanError
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
+from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -23,6 +25,8 @@ from lidargrit.data.sources.sample_formats import (
 )
 from lidargrit.data.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
 from lidargrit.data.sources.source import Source
+from lidargrit.scans.many_scans import usable_scans
+from lidargrit.scans.projection.sensor_check import closest_sensor
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
@@ -46,8 +50,26 @@ class DatasetSource(Source):
 
     @property
     def sensor(self) -> SensorModel:
-        """Sensor that made the scans."""
-        return load_sensor(self._dataset.sensor)
+        """Sensor that made the scans; see :attr:`sensor_name`."""
+        return load_sensor(self.sensor_name)
+
+    @property
+    def sensor_name(self) -> str:
+        """Name or file of the sensor that made the scans; of files that name none, the one that looks closest."""
+        return self._sensor_name
+
+    @cached_property
+    def _sensor_name(self) -> str:
+        if self.data_set != "folder" or self._dataset.sensor != Folder.sensor:
+            return self._dataset.sensor
+        try:
+            (scan,), _ = usable_scans(self._dataset, range(len(self._dataset)), at_most=1)
+        except ScanError:  # of all of them, and told where they are used
+            return self._dataset.sensor
+        name = closest_sensor(scan)
+        told = f"{self.text}: no sensor is named, so {name} is taken, which looks closest; --sensor names another"
+        reporting.message(told)
+        return name
 
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant of the images that were opened last, else the one that the configuration names."""

@@ -35,6 +35,11 @@ class Source(ABC):
     def sensor(self) -> SensorModel:
         """Sensor whose rays the scans or images lie on."""
 
+    @property
+    def sensor_name(self) -> str:
+        """Name or file of the sensor that made the scans; "" for images, which hold theirs."""
+        return ""
+
     @abstractmethod
     def projection_variant(self, config: DataConfig) -> str:
         """Return the variant of the projection by which scans become, or became, images; "" where it is not known."""

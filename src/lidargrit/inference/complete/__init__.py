@@ -16,7 +16,7 @@ from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import KINDS, ConditionKind, Observed
 from lidargrit.scans.fills import FILLS
 from lidargrit.scans.projection import ProjectionVariant
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import ProjectionOption, SensorModel
 from lidargrit.scans.types import RangeImage
 
 _JOBS: dict[ConditionKind, Job] = {"pixels": "complete", "surfaces": "raydrop"}
@@ -31,12 +31,14 @@ class Model:
         generator: generator of a run, or a classical method.
         sampling: settings by which it completes.
         folder: folder of its run; None for a classical method.
+        projection: way in which points find their rows; ``sensor`` for the sensor's own, or what fits the points.
     """
 
     name: str
     generator: Generator[Any, Any]
     sampling: object
     folder: Path | None = None
+    projection: ProjectionOption = "sensor"
 
     @property
     def sensor(self) -> SensorModel:

@@ -1,5 +1,6 @@
 """The verbs complete, upsample and raydrop: a source, a model, a task and a folder → files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from lidargrit.data.prepared.config import DataConfig
@@ -36,6 +37,7 @@ def complete_scans(
         ScanError: a scan that cannot be used, of another sensor, or without a return among the observed pixels.
     """
     config = config or DataConfig()
-    inputs = open_inputs(source, task.reader(model.sensor, model.projection_variant), config)
+    reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)
+    inputs = open_inputs(source, reader, config)
     facts = {"verb": task.verb, "source": source, **task.identity()}
     return write_completions(inputs, out, model, task, output, facts, config)

@@ -52,7 +52,7 @@ class OutputConfig:
 
     def __post_init__(self) -> None:
         if self.count < 1:
-            raise ConfigError(f"-n {self.count}", "at least 1 completion of each scan", "raise it")
+            raise ConfigError(f"--samples {self.count}", "at least 1 completion of each scan", "raise it")
         if self.probability < 0:
             raise ConfigError(f"--probability {self.probability}", "0 or more samples", "raise it")
 
@@ -166,7 +166,7 @@ def _write_cloud(
 def _facts(model: Model, output: OutputConfig) -> dict[str, Any]:
     """Return the entries of the manifest that say how the files are made."""
     if output.count > 1 and not model.generator.is_random:
-        got = f"-n {output.count} for {model.name}"
+        got = f"--samples {output.count} for {model.name}"
         raise ConfigError(got, "1: it completes a scan in one way", "leave it out")
     made = {**model.identity(), "count": output.count, "seed": output.seed, "format": output.format}
     if output.probability:

@@ -19,11 +19,18 @@ from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.grid import RayGrid
-from lidargrit.scans.projection import ProjectionVariant, doubts_about_rays, index_map, project_by_what_fits, unproject
+from lidargrit.scans.projection import (
+    ProjectionVariant,
+    doubts_about_rays,
+    index_map,
+    project,
+    project_by_what_fits,
+    unproject,
+)
 from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
 from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count, told_doubt
-from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import ProjectionOption, SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
 
@@ -155,12 +162,14 @@ class ScanReader:
     Args:
         variant: variant of the projection.
         partial: whether a scan of a part of the circle is accepted.
+        projection: way in which points find their rows; ``sensor`` for what fits the points.
         few_rings_cure: cure of a scan of far fewer rows.
     """
 
     sensor: SensorModel
     variant: ProjectionVariant = "exact"
     partial: bool = False
+    projection: ProjectionOption = "sensor"
     few_rings_cure: str = (
         "add the missing rows with: lidargrit upsample; a classical method completes them on their own sensor"
     )
@@ -173,7 +182,12 @@ class ScanReader:
                 f"the {self.sensor.height} of the sensor {self.sensor.name!r}",
                 self.few_rings_cure,
             )
-        image, method, variant = project_by_what_fits(scan, self.sensor, self.variant, self.partial)
+        if self.projection == "sensor":
+            image, method, variant = project_by_what_fits(scan, self.sensor, self.variant, self.partial)
+        else:
+            method = self.projection
+            variant = self.variant if method == self.sensor.projection else "exact"
+            image = project(scan, self.sensor, method, variant, self.partial)
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
         doubt = doubts_about_rays(scan, self.sensor, method)
         said = told_doubt(scan.source, self.sensor, doubt)
@@ -221,8 +235,3 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
             "name a model for such images with --model, or give the scans as points",
         )
     return Inputs(scans, reader)
-
-
-def sensor_of(source: str, name: str = "") -> SensorModel:
-    """Return the sensor of a source of scans, or the one that is named for it by a name or a ``.json`` file."""
-    return load_sensor(name) if name else open_source(source).sensor

@@ -40,7 +40,7 @@ class SparseReader(ScanReader):
         A wanted column in which none lies stays unknown, since no ray went there.
         """
         wanted = self.sensor
-        seen = ScanReader(self._imaged, self.variant, self.partial).read(scan)
+        seen = ScanReader(self._imaged, self.variant, self.partial, self.projection).read(scan)
         assert seen.point_of_pixel is not None
         rows, of_column = self._rows(), self._columns()
         own, target, fired = (rows >= 0).nonzero()[:, 0], rows[rows >= 0], of_column >= 0

@@ -45,7 +45,8 @@ class Task(ABC):
             ScanError: a scan that cannot be used, or of another sensor.
         """
         grid = self.grid(scan, model.sensor)
-        return replace(self.reader(grid.sensor, model.projection_variant).read(scan), grid=grid)
+        reader = replace(self.reader(grid.sensor, model.projection_variant), projection=model.projection)
+        return replace(reader.read(scan), grid=grid)
 
     @abstractmethod
     def condition(self, seen: InputScan, seed: int) -> Observed:

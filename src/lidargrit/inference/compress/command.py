@@ -59,7 +59,7 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
         ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
-    reader = ScanReader(codec.sensor, projection_variant(locate(model)))
+    reader = ScanReader(codec.sensor, projection_variant(locate(model)), projection=config.projection)
     inputs = open_inputs(source, reader, config)
     check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
     chosen = {"source": source, "max_scans": config.max_scans}

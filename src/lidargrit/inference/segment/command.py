@@ -20,6 +20,7 @@ from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.inference.segment.points import labels_of_points
 from lidargrit.inference.segment.scores import LabelScores
 from lidargrit.scans.classes import CLASS_BITS, as_semantic_kitti
+from lidargrit.scans.sensors import ProjectionOption
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
 
@@ -63,7 +64,7 @@ def segment_scans(
     segmenter = open_segmenter(model, device)
     source_scans = _opened(source, segmenter, config)
     source_scans.check_output(out)
-    scans = _LabelledScans(source_scans, segmenter)
+    scans = _LabelledScans(source_scans, segmenter, config.projection)
     files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
     identities = {file: source_scans.identity(index) for index, file in enumerate(files)}
     facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment")), "scans": identities}
@@ -108,12 +109,13 @@ class _LabelledScans:
     Args:
         scans: scans of the source.
         segmenter: segmenter of a run.
+        projection: way in which points find their rows.
     """
 
-    def __init__(self, scans: NamedScans, segmenter: Segmenter) -> None:
+    def __init__(self, scans: NamedScans, segmenter: Segmenter, projection: ProjectionOption) -> None:
         self._scans, self._segmenter = scans, segmenter
         self._reader, self._told = (
-            ScanReader(segmenter.sensor.fine(), partial=True, few_rings_cure=_FEW_RINGS_CURE),
+            ScanReader(segmenter.sensor.fine(), "exact", True, projection, _FEW_RINGS_CURE),
             set[str](),
         )
 

@@ -13,6 +13,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
 from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
+from lidargrit.scans.fit_sensor.known import notes_on_sensor
 from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
@@ -126,7 +127,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=(*_notes_of(scans), *_warnings(rows, rings, len(scans), columns)),
+        warnings=(*_notes_of(scans), *notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns)),
     )
 
 

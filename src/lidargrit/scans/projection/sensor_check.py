@@ -44,11 +44,8 @@ _EMPTY_BETWEEN_AT_MOST, _COLUMNS_AROUND = 0.2, 3
 _RINGS_OFF_AT_MOST_DEG = 2.0  # of a sensor that may be the scan's: in the mean over its rows
 _FEW_POINTS = 0.02  # of what a row has in the median: a stray point does not fill a row
 
-# True in all commands: some choose the projection and the sensor of the scans, in others these are the model's.
-_BY_ELEVATION = (
-    "project by elevation where the command lets you: data.projection=spherical (in Python: method='spherical')"
-)
-_NAME_IT = "take a model of the sensor that made the scan, or name that sensor where the command lets you"
+_BY_ELEVATION = "project by elevation: --projection spherical (in Python: method='spherical')"
+_NAME_IT = "name the sensor that made the scan with --sensor, or take a model of it"
 FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file in place of a sensor"
 
 
@@ -280,7 +277,7 @@ def _misplaced(
         "a scan of this sensor",
         _name_sensor(scan, sensor)
         if method == "unfolding"
-        else "choose data.projection_variant=exact where the command lets you (in Python: variant='exact')",
+        else "choose --set data.projection_variant=exact (in Python: variant='exact')",
     )
 
 

@@ -21,6 +21,7 @@ from lidargrit.scans.sensors._columns import mean_azimuths_rad as mean_azimuths_
 _REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
 
 ProjectionName = Literal["spherical", "unfolding"]
+ProjectionOption = Literal["sensor", ProjectionName]  # the first: as the sensor has them
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ _RELEASED = {
 
 Learning rates, batches and epochs are the same in both: the paper gives none, and its presets have them from the files
 of configs/train_cfg. ``row_drop`` and ``col_drop`` there, which hide rows and columns of the input, are not built.
-The program samples among the 100 likeliest tokens: ``lidargrit sample --set top_k=100``. It trains on drive 0005, too,
+The program samples among the 100 likeliest tokens: ``sample --set sampling.top_k=100``. It trains on drive 0005, too,
 and chooses weights by drives that it trains or is tested on; that is not repeated (see docs/data.md).
 """
 

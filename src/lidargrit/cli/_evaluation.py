@@ -1,0 +1,39 @@
+"""Options of ``evaluate`` → a table, its plain values, and what writes the report."""
+
+import argparse
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
+
+_OF_TABLES = ("tables", "table")
+_OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
+_OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
+
+
+def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
+    """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.evaluation.command import evaluate, evaluate_streets, read_config, streets_of
+    from lidargrit.evaluation.tables import read_tables
+    from lidargrit.viewer.curves import plot_curves
+    from lidargrit.viewer.report import write_report
+
+    if options.tables:
+        refuse_unused(options, "beside --tables", _OF_TABLES)
+        return *read_tables(options.tables, options.table), None
+    names = ("protocol", "device", *_OF_CARDS)
+    config = read_config(
+        scan_settings(options, max_scans=options.count), **{name: vars(options)[name] for name in names}
+    )
+    sets = (options.samples, options.reference)
+    streets = streets_of(options.samples, config) if options.reference else None
+    if streets is None:
+        refuse_unused(options, "without --tables or --protocol streets", (*_OF_BOTH, *_OF_CARDS))
+        return evaluate(*sets, config, options.report, write_report, options.overwrite)
+    refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model"))
+    refuse_to_overwrite(options.report, options.overwrite, ".png")
+    text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model)
+    plot = partial(plot_curves, curves, options.report, f"real: {options.reference}") if options.report else None
+    return text, values, plot
