@@ -98,7 +98,7 @@ def ours(generator: Generator, stage: str, preset: Preset, images: RangeImages, 
     scans = (UNTIMED + steps) * config.batch_size
     never = {"validate_every": 10**9, "checkpoint_every": 10**9, "validation_scans": 1}
     heard = StepClock()
-    fit = StageTraining(generator.objective(stage), replace(config, scans=scans, **never), folder, 0)
+    fit = StageTraining(generator.objective(stage), replace(config, scans=scans, **never), folder, 0).begun()
     with reporting.to(heard):
         fit.run(images, images, stage)
     return steps * config.batch_size / (heard.times[-1] - heard.times[UNTIMED - 1])

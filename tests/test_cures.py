@@ -83,11 +83,11 @@ def words_of(verb: str, folder: Path, tmp_path: Path) -> list[str]:
 def options_named(message: str, verb: str) -> list[tuple[str, str]]:
     """Return each option that a message tells to type, with the verb that it is for."""
     found = []
-    for command in re.split(r"(?=lidargrit [a-z][a-z-]+)", message):
-        other = re.match(r"lidargrit ([a-z][a-z-]+)", command)
+    for part in re.split(r"[,;()]| or (?=leave|name|take)", message):  # a command ends where the sentence goes on
+        other = re.search(r"lidargrit ([a-z][a-z-]+)", part)
         of = other[1] if other and other[1] in PARSERS else verb
-        found += [(of, option) for option in re.findall(r"(?<![\w-])--[a-z][a-z-]+", command)]
-        if "data." in command:
+        found += [(of, option) for option in re.findall(r"(?<![\w-])--[a-z][a-z-]+", part)]
+        if "data." in part:
             found.append((of, "--set"))
     return found
 

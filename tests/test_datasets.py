@@ -146,7 +146,7 @@ def test_drives_that_may_not_be_read_are_not_passed_over(tmp_path, monkeypatch):
 
 def test_the_wish_to_drop_points_reaches_the_reader(bin_file):
     folder = bin_file(with_cell(0, 0, np.nan)).parent
-    with pytest.raises(ScanError, match="bad_points=drop"):
+    with pytest.raises(ScanError, match="--bad-points drop"):
         open_dataset(str(folder)).scan(0)
     assert len(open_dataset(str(folder), bad_points="drop").scan(0)) == 2
 

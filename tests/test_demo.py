@@ -4,7 +4,7 @@ import json
 from functools import partial
 
 from lidargrit.cli import main
-from lidargrit.core.reporting import TerminalReporter
+from lidargrit.core import reporting
 from lidargrit.data.datasets import load
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.generation.settings import Preset
@@ -37,7 +37,8 @@ def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, 
 
 def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):
     def chosen(*settings: str, data: str | None = None, anew: bool = False) -> tuple[Preset, str, str]:
-        preset = demo._preset(data, [*settings], TerminalReporter(), anew)
+        with reporting.to(reporting.TerminalReporter()):
+            preset = demo._preset(data, [*settings], anew)
         return preset, demo.how_trained(preset), capsys.readouterr().err
 
     preset, words, said = chosen()

@@ -113,7 +113,7 @@ def test_what_is_there_is_kept_and_more_is_added(drive, tmp_path):
         write_drives(drive, 6, replace(config, seed=6))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("dear")
-    with pytest.raises(OutputError, match="holds no simulation"):
+    with pytest.raises(OutputError, match=r"holds no simulated\.json"):
         write_drives(tmp_path / "mine", 1, config)
 
 

@@ -13,10 +13,11 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
 from lidargrit.data.datasets import open_dataset
-from lidargrit.data.export import MANIFEST, KittiTree, export_scans
+from lidargrit.data.export import MANIFEST, export_scans
 from lidargrit.data.formats import read_scan
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.scan_folder import KittiTree
 from lidargrit.data.sources import open_images
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor

@@ -76,9 +76,8 @@ def test_orders_that_are_none_of_firing_are_recognised(fired):
         image = project(scan, HDL64E, "spherical")
         assert (image.return_mask == by_ring.return_mask).float().mean() > 0.999, name
         for variant in ("exact", "reference"):
-            with pytest.raises(ScanError, match=r"project by elevation: --projection spherical") as refusal:
+            with pytest.raises(ScanError, match=r"project by elevation: --projection spherical"):
                 project(scan, HDL64E, variant=variant)
-            assert "--" not in str(refusal.value), "complete, likelihood and others have no such option"
             assert inspect(scan, HDL64E, variant=variant).problems, (name, variant)
 
 

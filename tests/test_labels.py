@@ -9,11 +9,11 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
-from lidargrit.data.export import KittiTree
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.data.scan_folder import KittiTree
 from lidargrit.generation.generator import load
 from lidargrit.scans.classes import LEARNED
 from lidargrit.scans.condition import Observed

@@ -250,9 +250,9 @@ def test_a_batch_in_parts_takes_the_same_step(tmp_path, parts):
 def test_parts_that_cannot_be_are_refused(tmp_path):
     learn = TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3, accumulate=3)
     with pytest.raises(ConfigError, match="batch_size=4 on 1 processes in 3 parts each; wanted a multiple of 3"):
-        StageTraining(Plain(), learn, tmp_path, 0)
+        StageTraining(Plain(), learn, tmp_path, 0).begun()
     with pytest.raises(ConfigError, match="accumulate=2 for players who take turns"):
-        StageTraining(Game(), replace(learn, accumulate=2), tmp_path, 0)
+        StageTraining(Game(), replace(learn, accumulate=2), tmp_path, 0).begun()
     with pytest.raises(ConfigError, match="accumulate=0"):
         replace(learn, accumulate=0)
 
@@ -261,7 +261,8 @@ def test_a_validation_needs_no_more_memory_than_a_step(tmp_path, monkeypatch):
     config = DataConfig(train=("simulated:4:train",), val=(), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
     learn = TrainingConfig(scans=4, batch_size=4, accumulate=2, learning_rate=1e-3, validation_scans=4)
-    fit = StageTraining(Vqvae(load_preset("lidargrit_demo", STEADY).model.tokenizer, images.sensor), learn, tmp_path, 0)
+    vqvae = Vqvae(load_preset("lidargrit_demo", STEADY).model.tokenizer, images.sensor)
+    fit = StageTraining(vqvae, learn, tmp_path, 0).begun()
     sizes = []
     monkeypatch.setattr(fit.engine, "evaluate", lambda objective, some, seed: sizes.append(len(some)) or {"loss": 1.0})
     assert fit.validate(images) == {"loss": 1.0}

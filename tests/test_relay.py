@@ -41,7 +41,7 @@ def fit(folder, config=STEPS):
     torch.manual_seed(0)
     cls = load_class("r2dm")
     objective = cls(replace(cls.smallest_config(SENSOR), reflectance=False), SENSOR).objective("diffusion")
-    return StageTraining(objective, config, folder / "tokenizer", 0)
+    return StageTraining(objective, config, folder / "tokenizer", 0).begun()
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
-from lidargrit.data.export import KittiTree
+from lidargrit.data.scan_folder import KittiTree
 from lidargrit.evaluation.metrics.shared.labelled import segmenter_of
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.inference.segment.points import labels_of_points

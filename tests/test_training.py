@@ -192,10 +192,17 @@ def test_the_linear_schedule_is_the_programs(golden):
     assert max(abs(a - b) for a, b in zip(ours, factors, strict=True)) < 0.02
 
 
+def test_a_stage_does_nothing_before_it_begins(tmp_path, images, monkeypatch):
+    monkeypatch.setattr("lidargrit.training.stage.begin_training", lambda *_: pytest.fail("launched"))
+    vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
+    StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path / "stage", 0)
+    assert not (tmp_path / "stage").exists()
+
+
 def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     vqvae = Vqvae(load_preset("lidargrit_demo", TINY).model.tokenizer, images.sensor)
     vqvae.encoder.conv_in.weight.data.fill_(torch.nan)
-    fit = StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0)
+    fit = StageTraining(vqvae, TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3), tmp_path, 0).begun()
     with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 0 scans") as error:
         fit.run(images, images, "training")
     assert "checkpoint" not in str(error.value), "there is none yet"
@@ -216,7 +223,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
         scans=180, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=30, precision="auto",
         average_over_scans=20, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
-    fit = StageTraining(vqvae, learn, tmp_path, 0)
+    fit = StageTraining(vqvae, learn, tmp_path, 0).begun()
     fit.run(scan, scan, "training")
     learned = fit.validate(scan)
     assert learned["range_mae_m"] < 0.3

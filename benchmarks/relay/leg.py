@@ -144,7 +144,8 @@ def _fit(
     torch.manual_seed(seed)
     built_on = fingerprint(generator.objective("tokenizer")) if finished else ""
     objective, config, workers = generator.objective(stage), preset.settings_of(stage), preset.data.workers
-    return StageTraining(objective, config, run / stage, seed, built_on, workers, deadline_s=deadline_s)
+    stage_training = StageTraining(objective, config, run / stage, seed, built_on, workers, deadline_s=deadline_s)
+    return stage_training.begun()
 
 
 @torch.no_grad()

@@ -27,9 +27,9 @@ def changed(rows: np.ndarray, name: str) -> bytes:
 DAMAGE = {
     "cut short": r"got \d+ bytes in .*BAD.*, 13 more than whole points; wanted .*16 bytes a point; download it again",
     "empty": r"got an empty file, .*BAD.*; wanted float32 rows .*; download it again, or remove it",
-    "NaN": r"got 1 of \d+ points with NaN or infinite coordinates in .*BAD.*; --?.*|.*bad_points=drop",
-    "infinite": r"got 2 of \d+ points with NaN or infinite coordinates in .*BAD.*; .*--set data\.bad_points=drop",
-    "origin": r"got 1 of \d+ points at the origin .* in .*BAD.*; .*--set data\.bad_points=drop",
+    "NaN": r"got 1 of \d+ points with NaN or infinite coordinates in .*BAD.*; .*--bad-points drop",
+    "infinite": r"got 2 of \d+ points with NaN or infinite coordinates in .*BAD.*; .*--bad-points drop",
+    "origin": r"got 1 of \d+ points at the origin .* in .*BAD.*; .*--bad-points drop",
     "reflectance": r"got reflectance from 0 to \d+.* in .*BAD.*; wanted values in \[0, 1\]; .*divide",
 }
 

@@ -58,11 +58,7 @@ def add_settings(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def sampling_words(words: Sequence[str]) -> list[str]:
-    """Return the settings of sampling among those of ``--set``, without the ``sampling.`` before their names.
-
-    Raises:
-        ConfigError: a setting of nothing, without data. or sampling. before its name.
-    """
+    """Return the settings of sampling among those of ``--set``, without the ``sampling.`` before their names."""
     for word in words:
         if not word.startswith(("sampling.", "data.")):
             wanted = "sampling. before a setting of sampling, data. before one of reading scans"
@@ -98,9 +94,6 @@ def refuse_unused(options: argparse.Namespace, when: str, takes: Collection[str]
         options: parsed options of the verb.
         when: words for the mode, such as "with --tables".
         takes: names of what it takes then.
-
-    Raises:
-        ConfigError: another option or word is given; names the first.
     """
     for action in options.words._actions:
         given = getattr(options, action.dest, None)

@@ -93,11 +93,7 @@ class Parser(argparse.ArgumentParser):
         return [parser for action in below for parser in action.choices.values()]
 
     def refuse(self, word: str) -> NoReturn:
-        """Refuse an option that this parser does not have, or a word too many.
-
-        Raises:
-            UsageError: says so, and names the nearest options.
-        """
+        """Refuse an option that this parser does not have, or a word too many."""
         long = [option for option in self._option_string_actions if option.startswith("--")]
         option = word.startswith("-")
         got, wanted = (

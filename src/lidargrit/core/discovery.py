@@ -86,6 +86,7 @@ def load_instance(kind: str, name: str, base: type[T]) -> T:
     return _the_one(kind, name, lambda value, _: value if isinstance(value, base) else None)
 
 
+@cache
 def _packages(kind: str) -> dict[str, Path]:
     """Return the packages that hold a kind, by their folders: importlib would import the packages above them."""
     folders = [path for path in _ROOT.glob(FOLDERS[kind]) if path.is_dir()]
@@ -95,20 +96,22 @@ def _packages(kind: str) -> dict[str, Path]:
 
 def _places(kind: str) -> dict[str, _Place]:
     """Return where each name of a kind is defined."""
-    found = {}
-    for package, folder in _packages(kind).items():
-        if kind == "presets":
-            file, module = folder / "presets.py", f"{package}.presets"
-            entries = _entries(file) if file.is_file() else {}
-            found |= {name: _Place(file, module, *entry) for name, entry in entries.items()}
-        else:
-            found |= {path.stem: _Place(path, f"{package}.{path.stem}") for path in folder.glob("[!_]*.py")}
-            systems = [path.parent.name for path in folder.glob("[!_]*/system.py")]
-            found |= {name: _Place(folder / name / "system.py", f"{package}.{name}.system") for name in systems}
-    return found
+    of_presets = kind == "presets"
+    return {name: place for at in _packages(kind).items() for name, place in _found_in(*at, of_presets).items()}
 
 
-@cache
+@cache  # a comparison asks hundreds of times, and the folders of the program stay as they are
+def _found_in(package: str, folder: Path, of_presets: bool) -> dict[str, _Place]:
+    if of_presets:
+        file, module = folder / "presets.py", f"{package}.presets"
+        entries = _entries(file) if file.is_file() else {}
+        return {name: _Place(file, module, *entry) for name, entry in entries.items()}
+    systems = [path.parent.name for path in folder.glob("[!_]*/system.py")]
+    return {path.stem: _Place(path, f"{package}.{path.stem}") for path in folder.glob("[!_]*.py")} | {
+        name: _Place(folder / name / "system.py", f"{package}.{name}.system") for name in systems
+    }
+
+
 def _entries(file: Path) -> dict[str, tuple[str, str]]:
     """Return the table and the title of each preset of a file, as they are written there.
 
@@ -131,8 +134,9 @@ def _entries(file: Path) -> dict[str, tuple[str, str]]:
 
 
 def _the_one(kind: str, name: str, chosen: Callable[[object, str], T | None]) -> T:
-    known = names(kind)
-    if name not in known:
+    if name not in names(kind):
+        _found_in.cache_clear()  # its file may have been added since
+    if name not in (known := names(kind)):
         raise UnknownNameError(
             f"{name!r}, which is not among the {kind}",
             f"one such as {nearest_names(name, known)}",

@@ -148,6 +148,11 @@ def one_of(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " or " + names[-1]
 
 
+def no_usable_scan(source: str) -> "DataError":
+    """Return the error of a source every scan of which was left out, each with a message of its own."""
+    return DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+
+
 def counted_scans(count: int, kind: str = "") -> str:
     """Say a number of scans: "1 scan", "3 completed scans"."""
     return f"{count:,} {kind}{' ' if kind else ''}{'scan' if count == 1 else 'scans'}"

@@ -26,7 +26,6 @@ class Batches:
         batch_size: number of scans in a batch, over all processes.
         augmentations: kinds of augmentation, applied in this order.
         any_columns: whether an image may begin at any fine column; see :class:`TrainingConfig`.
-        seed: seed of order and augmentation.
         rank: number of this process, from 0; it takes its share of every batch.
         world_size: number of processes that train together.
         workers: number of threads that read ahead.

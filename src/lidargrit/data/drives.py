@@ -9,18 +9,17 @@ import numpy as np
 from jaxtyping import Float64
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ConfigError, DataError, OutputError, counted_scans
+from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.core.files import (
     atomic_path,
     claim_folder,
     claimed_manifest,
-    is_taken,
-    read_json,
     write_json,
     write_text,
 )
 from lidargrit.core.processes import process_pool
 from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.scan_folder import begun_by
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, scene_of
 
@@ -89,11 +88,6 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
 
     Returns:
         Number of scans that are there now.
-
-    Raises:
-        ConfigError: no scan, no process, or more frames than a street has.
-        OutputError: the folder holds something else.
-        DataError: a street of which no ray returns.
     """
     if num_scans < 1 or workers < 1:
         raise ConfigError(
@@ -124,14 +118,8 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
 
 def _claim(out: Path, config: DriveConfig) -> None:
     facts = config.to_json()
-    if (out / MANIFEST).exists():
-        if read_json(out / MANIFEST) != facts:
-            raise OutputError(
-                f"{out}, which holds scans simulated in another way", "an empty folder", "choose another folder"
-            )
-    elif is_taken(out):
-        raise OutputError(f"{out}, which is not empty and holds no simulation", "an empty folder", "choose another")
-    else:
+    other = "which holds scans simulated in another way"
+    if begun_by(out / MANIFEST, lambda there: "" if there == facts else other) is None:
         write_json(out / MANIFEST, facts)
 
 

@@ -42,11 +42,7 @@ def named_folder(name: str | Path) -> Path:
 
 
 def locate(name: str | Path, job: Job = "sample") -> Path:
-    """Return the folder of a run; of a bundle, that of the run which does a job, and of the one that samples if none.
-
-    Raises:
-        CheckpointError: a bundle whose file does not name its runs.
-    """
+    """Return the folder of a run; of a bundle, that of its run for a job, and of the one that samples if none."""
     folder = named_folder(name)
     if not is_bundle(folder):
         return folder
@@ -85,7 +81,6 @@ class SavedConfig(NamedTuple):
     """What the configuration of a finished run says.
 
     Args:
-        generator: name of its generator.
         config: configuration of the generator, as plain values.
     """
 
@@ -95,11 +90,7 @@ class SavedConfig(NamedTuple):
 
 
 def read_config(folder: Path) -> SavedConfig:
-    """Read the configuration of a finished run.
-
-    Raises:
-        CheckpointError: no finished run in the folder, or a damaged file.
-    """
+    """Read the configuration of a finished run."""
     if not is_run(folder):
         packaged = [each.name for each in PACKAGED]
         if not folder.exists():
@@ -166,11 +157,7 @@ def projection_variant(folder: Path) -> ProjectionVariant:
 
 
 def trained_on(folder: Path) -> Provenance:
-    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known.
-
-    Raises:
-        CheckpointError: a file that lidargrit did not write.
-    """
+    """Return what the model of a run, or of a folder of samples, learned from; empty where that is not known."""
     path = trained_on_file(folder)
     if path is None:
         return Provenance()

@@ -20,9 +20,6 @@ def read_trajectory(path: Path) -> Trajectory:
             file of rows ``time x y z qx qy qz qw``, poses of the lidar itself, as evo, KISS-ICP and other odometries
             write them.
 
-    Raises:
-        DataError: no such file, or one with something else in it.
-
     Source:
         Geiger et al., CVPR 2012 (KITTI); Sturm et al., A Benchmark for the Evaluation of RGB-D SLAM Systems, IROS 2012.
     """

@@ -80,9 +80,6 @@ class Benchmark:
 
         Args:
             check: whether it is still to be trained, so that its stages have to follow the settings.
-
-        Raises:
-            ConfigError: a setting that the preset does not take, or that one of its stages cannot follow.
         """
         preset = load_preset(name, self.preset_settings)
         if check:
@@ -106,10 +103,6 @@ def run(
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
-
-    Raises:
-        ConfigError: a system that occurs twice, or a preset that does not take a setting.
-        OutputError: another comparison writes into the folder, or it cannot be written to.
     """
     names = [_folder_name(system) for system in systems]
     if len(set(names)) < len(names) or not names:

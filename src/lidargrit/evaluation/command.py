@@ -42,10 +42,6 @@ def evaluate(
 
     Returns:
         a table, its plain values, and a function that writes the report, None where none is wanted.
-
-    Raises:
-        ConfigError: a name is missing, or an option has no meaning for these sets or metrics.
-        OutputError: the report is there already.
     """
     if not (samples and reference):
         got = f"{samples!r} alone" if samples else "nothing to score"
@@ -91,10 +87,6 @@ def evaluate_streets(
 
     Returns:
         tables, their plain values, and the curves, which can be plotted.
-
-    Raises:
-        ConfigError: a model that drops no returns, or scans of another sensor.
-        DataError: fewer than two real scans.
     """
     drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
     simulated, real = scans_of_both(
@@ -119,15 +111,11 @@ def read_config(
     """Turn words and numbers, as a user types them, into a configuration.
 
     Args:
-        scans: settings of reading scans.
         metrics: names of metrics, in place of the protocol's.
         weights: words such as ``pointnet=FILE``.
         groups: number of groups that each set is cut into.
         intervals: number of half-samples; 0 for no intervals.
         settings: further settings of :class:`EvalConfig`, by name.
-
-    Raises:
-        ConfigError: a setting out of its bounds, or weights of a network that no metric uses.
     """
     scans = scans or ScanSettings()
     settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans

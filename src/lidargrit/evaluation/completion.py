@@ -84,7 +84,6 @@ def compare_completion(
     """Hide parts of scans, have every model fill them in, and compare.
 
     Args:
-        images: whole scans.
         models: models and classical methods, of the sensor of the images.
         patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
         completions: number of completions of each scan by a model that is random.
@@ -92,11 +91,6 @@ def compare_completion(
 
     Returns:
         scores of all models by the first pattern, then by the next.
-
-    Raises:
-        ConfigError: a model of another sensor.
-        DataError: no scan.
-        UsageError: a pattern that hides no return, so that there is nothing to compare.
     """
     if not len(images) or completions < 1:
         raise DataError(

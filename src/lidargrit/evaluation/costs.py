@@ -76,11 +76,7 @@ class Costs:
         write_json(self.path, {"weights_sha256": self.weights_sha256, **dict.fromkeys(_ENTRIES), "scans": 0})
 
     def add_bits(self, generator: Generator, scans: EvalSet) -> None:
-        """Add the bits a return of the reference to the file, unless those of the same scans are there.
-
-        Args:
-            scans: the reference.
-        """
+        """Add the bits a return of the reference to the file, unless those of the same scans are there."""
         costs = read_costs(self.path)
         reference = {"sha256": scans.record().sha256, "range_m": list(scans.range_m or ())}
         if costs.get("reference") == reference:
@@ -94,11 +90,7 @@ class Costs:
 
 
 def read_costs(path: Path) -> dict[str, Any]:
-    """Read what :class:`Costs` wrote.
-
-    Raises:
-        CheckpointError: the file cannot be read, or an entry lacks or is no number.
-    """
+    """Read what :class:`Costs` wrote."""
     of = read_json(path)
     for name in (*_ENTRIES, "scans"):
         if name not in of or not (type(of[name]) in (int, float) or (of[name] is None and name != "scans")):
@@ -113,9 +105,6 @@ def costs_block(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) 
     Args:
         files: name of each system, and its ``costs.json``.
         remarks: lines to print below the costs.
-
-    Raises:
-        CheckpointError: a file that cannot be read, or in which an entry lacks or is no number.
     """
     rows = []
     for name, path in files:

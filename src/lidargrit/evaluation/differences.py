@@ -31,13 +31,7 @@ class Comparison:
 
 
 def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecard) -> Comparison:
-    """Compare one system with another, both scored by one protocol against the same scans.
-
-    Args:
-        card: scores of the system.
-        other_name: name of the system that it is compared with.
-        other: scores of that other system.
-    """
+    """Compare one system with another, both scored by one protocol against the same scans."""
     ours, theirs = ({column_of(score): score for score in each.scores} for each in (card, other))
     asked = [*ours, *theirs, *((each.metric, each.variant) for each in (*card.left_out, *other.left_out))]
     names, groups = names_of(asked), _groups_in_common(card, other)

@@ -157,8 +157,6 @@ def merged(generated: Sequence[Part], real: Sequence[Part], whole: Metric | None
     """Return a new metric that has seen what the parts of both sets were fed, in their order.
 
     Args:
-        generated: parts of the generated set.
-        real: parts of the real set.
         whole: metric of larger sets whose choices are to be made; see :meth:`Metric.choose_as`.
     """
     metric = real[0].copy()
@@ -179,7 +177,6 @@ def interval_of(
     """Return the confidence interval of the score of the whole sets; None if there are too few scans.
 
     Args:
-        value: score of the whole sets.
         whole: metric that was fed the whole sets.
         generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.

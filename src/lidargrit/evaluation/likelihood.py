@@ -99,12 +99,7 @@ def score_likelihood(
 
     Args:
         generator: model with the capability ``likelihood``.
-        images: range images of its sensor.
         maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
-
-    Raises:
-        ConfigError: a model without probabilities, images of another sensor, or a step that is not one.
-        OutputError: the file cannot be written.
     """
     parts: dict[str, list[float]] = {}
     sensor, returns, whole = images.sensor, [], False
@@ -171,17 +166,12 @@ def measure_source(
     """Measure the scans of a source by a finished run: their bits, and the errors of their reconstructions.
 
     Args:
-        text: source of scans.
         model: finished run; scans are projected with its sensor, in the way of its training.
         maps: file to write the bits of every pixel to; none if not given.
 
     Returns:
         tables for people, and the same as plain values: bits of a model that has probabilities, errors of one with
         tokens.
-
-    Raises:
-        ConfigError: a model with neither, or without probabilities where a file of bits is wanted; a step that is none.
-        DataError: no usable scan, or scans of another sensor.
     """
     run = RunSource(model, locate(model))
     variant = run.projection_variant(config) or config.projection_variant

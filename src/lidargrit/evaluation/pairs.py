@@ -24,7 +24,6 @@ class EvalSet:
     """One set of range images that goes into the metrics.
 
     Args:
-        images: all images of the source.
         indices: indices of the images that are compared.
         range_m: nearest and farthest range of a return, in metres, both excluded; None for no limits.
         data_set: name of the data set; "samples" for generated images, "" where it is not known.
@@ -133,9 +132,6 @@ def pair_for_protocol(
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.
         sensor: sensor that scans are imaged with, in place of the protocol's; samples that are images keep theirs.
-
-    Raises:
-        ConfigError: the two sets look along different rays.
     """
     sensor = sensor or protocol.load_sensor()
     config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))

@@ -39,7 +39,6 @@ class RaydropScore:
     Args:
         scans: kind of the scans to which drops are added: ``simulated``; ``real``, with ranges that a tokenizer
             decodes; or ``real_triangulated``, with ranges that are interpolated from other rays' returns.
-        model: distance between the model's drops and the true ones.
         bernoulli: distance between the true drops and independent drops of one probability, on the same clean ranges.
         real_against_real: distance between the two halves of the true scans.
     """
@@ -54,13 +53,9 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
     """Drop returns of clean scans by a model, and independently of one another, and compare both with the true scans.
 
     Args:
-        generator: model that takes clean surfaces.
         scans: kind of the scans; see :class:`RaydropScore`.
         clean: batch of range images in which every surface returns.
         true: measured range images of the same scans, with true drops.
-
-    Raises:
-        ConfigError: a model that does not take clean surfaces.
     """
     _check(generator)
     dropped = []
@@ -87,9 +82,6 @@ def raydrop_model(word: str, device: str = "") -> Generator:
 
     Args:
         word: folder of a finished run, or ``pretrained``.
-
-    Raises:
-        ConfigError: a run that cannot do one of both; no such device.
     """
     generator = load(word).to(usable_device(device))
     _check(generator)
@@ -104,9 +96,6 @@ def scores_of_model(generator: Generator, simulated: SimulatedScans, real: Range
         generator: model of :func:`raydrop_model`.
         simulated: simulated scans of the run's sensor, before and after drops.
         real: real scans of its sensor.
-
-    Raises:
-        ConfigError: a model of another sensor.
     """
     decoded, true = decoded_surfaces(generator, real)
     pairs = {
@@ -124,11 +113,7 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
 
     Args:
-        generator: model with a tokenizer.
         real: scans of its sensor.
-
-    Raises:
-        ConfigError: a model without a tokenizer, or of another sensor.
     """
     _check_tokenizer(generator)
     if not generator.sensor.same_rays(real.sensor):

@@ -76,10 +76,6 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
         simulated: scans of the real ones' sensor, as many as wanted.
         real: real scans, at least two, in the order of their recording.
         curves: names of metrics. ``reflectance_histogram`` is left out where a real scan has no reflectance.
-
-    Raises:
-        ConfigError: the two look along different rays.
-        DataError: fewer than two real scans.
     """
     _require_two(real)
     if not simulated.clean.sensor.same_rays(real.sensor):
@@ -132,13 +128,8 @@ def scans_of_both(
 
     Args:
         streets: streets that are scanned with the sensor of the real scans.
-        source: source of real scans.
         sensor: name or ``.json`` file of the sensor; the source's own if empty.
         config: columns and projection of both, and their largest number; at most as many real scans as streets.
-
-    Raises:
-        ConfigError: fewer than two streets, or streets of another sensor.
-        DataError: fewer than two real scans.
     """
     seeds = [streets.seeds[index] for index in evenly_spaced(config.max_scans or len(streets), len(streets))]
     if len(seeds) < 2:
@@ -163,7 +154,6 @@ def simulate_pair(seed: int, rays: SensorModel, firing: SensorModel | None = Non
     """Simulate one scan and return both of its images: see :func:`pair_of`.
 
     Args:
-        rays: rays of the images.
         firing: sensor that fires. If it has other columns than ``rays``, all of its points are projected, so that the
             nearest of several may fill a pixel, as in a real scan. If not given, it fires once for each pixel.
     """

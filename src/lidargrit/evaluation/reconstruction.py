@@ -138,10 +138,6 @@ class ReconstructionScore:
             real: batch of scans that the tokenizer encoded.
             clean_range_m: decoded range (B, H, W) of every pixel in metres, without ray drop.
             return_mask: decoded mask (B, H, W), True = a return.
-
-        Raises:
-            ConfigError: the two pair differ in shape.
-            ScanError: a decoded range is not a number where the real scan has a return.
         """
         if not real.range_m.shape == clean_range_m.shape == return_mask.shape:
             raise ConfigError(
@@ -175,11 +171,7 @@ class ReconstructionScore:
             setattr(self, key, getattr(self, key) + value)
 
     def compute(self) -> ReconstructionErrors:
-        """Return the errors over all pairs so far.
-
-        Raises:
-            DataError: no pair, or not one return in the real scans.
-        """
+        """Return the errors over all pairs so far."""
         num_returns = self._only_decoded + self._neither
         if not num_returns:
             raise DataError(

@@ -163,12 +163,7 @@ class Reproduction:
 
 
 def prepare(benchmark: Benchmark, systems: Sequence[str]) -> None:
-    """Project all training scans before anything is trained: one that cannot be used is refused now, not after days.
-
-    Raises:
-        DataError: the root does not hold the data set, or a split of it.
-        ConfigError: a setting that a system cannot follow.
-    """
+    """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
     open_source(benchmark.reference)  # refuses a split that is not there
     for data in [benchmark.preset(system).data for system in systems]:
         load_range_images(data.train, data)

@@ -39,7 +39,6 @@ class EvalSetRecord:
         split: name of the split.
         scans: number of scans of the set.
         scans_used: number of scans that were compared.
-        sensor: name and size of its images.
         projection: description of the projection of its scans.
         sha256: hash of the pixels that were compared.
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.

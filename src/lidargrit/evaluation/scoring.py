@@ -33,13 +33,7 @@ class MetricFactory:
     device: str = "cpu"
 
     def __call__(self) -> Metric[Any, Any]:
-        """Return an empty metric.
-
-        Raises:
-            UnknownNameError: no such metric.
-            ConfigError: no such variant or device.
-            WeightsError: weights that cannot be found or read.
-        """
+        """Return an empty metric."""
         cls = load_metric(self.choice.metric)
         options: dict[str, Any] = {"variant": self.choice.variant or None, "seed": self.seed}
         if cls.needs_weights:
@@ -101,15 +95,11 @@ def score_metrics(
 
     Args:
         factories: functions that make the metrics.
-        pair: the two sets.
         resampling: settings of the intervals and of real against real.
         with_pixel_statistics: whether each score gets that of pixel statistics, if there are four scans or more.
 
     Returns:
         the score of each metric, or why it could not be computed: no weights, no reflectance, too few scans.
-
-    Raises:
-        ScanError: a damaged file, which spoils all metrics alike.
     """
     found: dict[int, Score | LidarGritError] = {}
     together: dict[Hashable, list[int]] = {}

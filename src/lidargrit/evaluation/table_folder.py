@@ -18,7 +18,6 @@ def write_table(folder: Path, systems: Sequence[str], benchmark: Benchmark, scor
     """Write ``table.json``, with every cell of the table; :func:`read_table` reads it.
 
     Args:
-        folder: output folder of the comparison.
         systems: names of the systems, as the user gave them.
         benchmark: settings that they share.
         scores: file of scores of each system.
@@ -28,11 +27,7 @@ def write_table(folder: Path, systems: Sequence[str], benchmark: Benchmark, scor
 
 
 def read_table(folder: Path) -> tuple[list[str], Benchmark]:
-    """Return the systems of a folder and the settings under which they were compared.
-
-    Raises:
-        ConfigError: no table in the folder, or one of settings that the command cannot repeat.
-    """
+    """Return the systems of a folder and the settings under which they were compared."""
     if not (folder / TABLE).is_file():
         raise ConfigError(f"{folder}, which holds no {TABLE}", "the folder of a finished comparison", _CURE)
     try:

@@ -57,9 +57,6 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
     Args:
         paths: files that ``lidargrit evaluate --json`` wrote.
         form: format of the table.
-
-    Raises:
-        DataError: a file that cannot be read, or is none of these.
     """
     if not paths:
         raise DataError("no file of scores", "at least one", "write some with: lidargrit evaluate ... --json FILE")

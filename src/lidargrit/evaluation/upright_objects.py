@@ -36,11 +36,7 @@ def upright_objects(images: RangeImage) -> Int[np.ndarray, "B H W"]:
     An object is a connected set of at least 40 pixels labelled as pole or trunk that spans at least twice as many rows
     as columns. One that lies across the first and the last column counts as two.
 
-    Args:
-        images: batch of range images with labels.
 
-    Raises:
-        ConfigError: images without labels.
     """
     if images.label is None:
         raise ConfigError("range images without labels", "labelled ones, such as simulated streets", "give those")

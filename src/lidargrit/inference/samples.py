@@ -12,11 +12,9 @@ from typing import Any
 import numpy as np
 
 from lidargrit.core import configuration, reporting
-from lidargrit.core.errors import OutputError
 from lidargrit.core.files import (
     atomic_path,
     claim_folder,
-    is_taken,
     read_json,
     remove_partials,
     removed_meanwhile,
@@ -24,6 +22,7 @@ from lidargrit.core.files import (
     write_text,
 )
 from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, trained_on_file, weights_sha256
+from lidargrit.data.scan_folder import begun_by
 from lidargrit.data.sources.samples import MANIFEST, is_sample_folder
 from lidargrit.generation.generator import Generator, SamplingT
 from lidargrit.scans.types import RangeImage
@@ -43,10 +42,6 @@ def write_samples(
         folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
-
-    Raises:
-        OutputError: the folder holds samples of another model or setting, something else, cannot be written, or was
-            removed while its samples were written.
     """
     sampling = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {
@@ -93,17 +88,8 @@ def sampling_identity(generator: Generator[Any, Any], run_folder: Path, sampling
 
 def _is_begun(folder: Path, manifest: dict[str, Any]) -> bool:
     """Return whether a folder holds samples of the same kind; False for a free one, others are refused."""
-    if (folder / MANIFEST).exists():
-        if not _same(read_json(folder / MANIFEST), manifest):
-            raise OutputError(
-                f"{folder}, which holds samples of another model or sampled in another way",
-                "an empty folder, or one that this very command began",
-                "choose another folder",
-            )
-        return True
-    if is_taken(folder) and not (folder / MANIFEST).exists():  # another process may just have begun it
-        raise OutputError(f"{folder}, which is not empty and holds no samples", "an empty folder", "choose another one")
-    return False
+    other = "which holds samples of another model or sampled in another way"
+    return begun_by(folder / MANIFEST, lambda there: "" if _same(there, manifest) else other) is not None
 
 
 def _begin(folder: Path, manifest: dict[str, Any]) -> None:

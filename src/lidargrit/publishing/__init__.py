@@ -37,12 +37,6 @@ def import_weights(preset: str, folder: Path, files: Sequence[Path], settings: S
         folder: folder that gets ``run.json``, ``model.safetensors`` and ``config.json``, as after training.
         files: files of ``torch.save``, in the order of the generator's ``published_files``; code in them is not run.
         settings: changed settings of the preset, such as ``data.projection_variant=reference``.
-
-    Raises:
-        ConfigError: another number of files than the generator's published weights consist of, or a network that is
-            larger than its file.
-        CheckpointError: a file that holds something else, or weights of other sizes; names the first.
-        OutputError: the folder holds something else.
     """
     if not (folder / RUN_FILE).is_file():
         _refuse_taken(folder, None)  # before much is read
@@ -83,11 +77,6 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
 
     Returns:
         Text of the card.
-
-    Raises:
-        CheckpointError: no finished run.
-        ConfigError: scores of samples of other weights, or weights that do not fit into 16 bits.
-        OutputError: the folder holds something else, or a finished card.
     """
     run = locate(run)
     generator = load(run)

@@ -58,7 +58,6 @@ class SemanticClass(NamedTuple):
     """One class of SemanticKITTI.
 
     Args:
-        name: name for a person.
         colour: red, green and blue.
         learned: number of the benchmark's class that it belongs to, which networks learn; 0 for none.
         group: coarse class, by which several data sets are compared.
@@ -191,9 +190,6 @@ def as_semantic_kitti(label: Int[Tensor, "*B"], numbering: str) -> Int[Tensor, "
     Args:
         label: labels, with or without instances in the bits above 16.
         numbering: one of :data:`NUMBERINGS`.
-
-    Raises:
-        ConfigError: no such numbering, or numbers that it does not have.
 
     Example:
         >>> as_semantic_kitti(torch.tensor([7, 13, 41]), "pandaset").tolist()

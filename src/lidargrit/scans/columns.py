@@ -61,14 +61,9 @@ def parts_of_columns(
     Args:
         columns: values of every point by their names.
         source: file or other origin of the columns, for messages.
-        bad_points: treatment of points that are no returns.
         others: names of columns that were not read.
         are_named: whether the file itself has the names; where it has not, reflectance that is none shows another
             layout, and is refused.
-
-    Raises:
-        ScanError: x, y or z is not there, rings or labels are not whole numbers, rings are counted from 1, or the
-            points are unfit.
     """
     named = {_plain(name): values for name, values in reversed(list(columns.items()))}
     if not {"x", "y", "z"} <= named.keys():
@@ -109,9 +104,6 @@ def columns_of_arrays(xyz: np.ndarray | Tensor, **values: Values | None) -> dict
     Args:
         xyz: coordinates (n, 3), or (n, 4) with intensity.
         values: further numbers of every point by their names; None for what is not known.
-
-    Raises:
-        ScanError: an array of another shape, or without numbers.
     """
     points = _array(xyz)
     if points.ndim != 2 or points.shape[1] not in (3, 4):
@@ -136,7 +128,6 @@ def selected(parts: ScanParts, which: Tensor) -> ScanParts:
     """Return all that is known point by point, for those points that a mask or their numbers choose.
 
     Args:
-        parts: parts of a scan.
         which: mask (n) or numbers (k) of the points.
     """
     rows, chosen = parts.get("rows"), ScanParts(points_xyz_m=parts["points_xyz_m"][which].contiguous())

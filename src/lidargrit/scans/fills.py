@@ -193,7 +193,6 @@ class Fill(NamedTuple):
 
     Args:
         range_m: observed pixels → range of every pixel, in metres.
-        reflectance: observed pixels and their reflectance → reflectance of every pixel.
     """
 
     range_m: Callable[[SeenScan], Float64[np.ndarray, "H W"]]
@@ -304,9 +303,6 @@ def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
 
     Blocks of pixels are divided at random into two halves, and each half is triangulated from the returns of the other.
     So returned and dropped rays cannot be distinguished by the noise of a measured range.
-
-    Raises:
-        ScanError: a scan without returns in one half.
     """
     sensor, device = images.sensor, images.range_m.device
     height, width = sensor.height, sensor.width

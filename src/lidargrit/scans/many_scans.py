@@ -34,9 +34,6 @@ def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -
         dataset: scans to choose from.
         indices: numbers of the wanted scans, in order.
         at_most: number of usable scans after which no further one is read; 0 for all.
-
-    Raises:
-        ScanError: none of them can be used; says what is wrong with the last.
     """
     scans, skipped = list[Scan](), list[str]()
     error = None

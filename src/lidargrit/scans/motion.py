@@ -25,10 +25,6 @@ class Trajectory:
     Args:
         times_s: times in seconds, rising.
         poses: matrix of each time, from the sensor's frame to that of the recording, in metres.
-        source: file of the poses, for messages.
-
-    Raises:
-        DataError: fewer than two poses, times that do not rise, or a matrix that does not turn and move alone.
     """
 
     times_s: Float64[np.ndarray, "m"]
@@ -104,11 +100,7 @@ class UndoMotion:
         return {"motion_undone_by": self.trajectory.source}
 
     def __call__(self, scan: Scan) -> Still:
-        """Return a scan without the motion.
-
-        Raises:
-            ScanError: points without times, or times at which no pose is known.
-        """
+        """Return a scan without the motion."""
         if scan.point_time_s is None:
             wanted = (
                 "points with times: a column time, t or timestamp, as Velodyne's, Ouster's or Hesai's drivers write"

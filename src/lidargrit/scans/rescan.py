@@ -47,12 +47,8 @@ class Rescan:
     that stand in front; what the first sensor did not see stays unseen.
 
     Args:
-        sensor: sensor that made the clouds.
         other: sensor whose clouds are wanted.
         raised_m: height in metres of the other sensor above the first; points are in its own frame.
-
-    Raises:
-        ConfigError: a height that no mounting has.
     """
 
     sensor: SensorModel
@@ -69,11 +65,7 @@ class Rescan:
         return {"to": self.other.to_json(), "of": self.sensor.to_json(), "raised_m": self.raised_m}
 
     def __call__(self, scan: Scan) -> Rescanned:
-        """Return a cloud as the other sensor sees it.
-
-        Raises:
-            ScanError: a cloud of which the other sensor sees nothing.
-        """
+        """Return a cloud as the other sensor sees it."""
         points_xyz_m = scan.points_xyz_m.clone()
         points_xyz_m[:, 2] -= self.raised_m
         xyz = points_xyz_m.double().numpy()

@@ -108,33 +108,20 @@ def observe(
 
 
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
-    """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car.
-
-    Raises:
-        ConfigError: a negative seed, or an unknown theme.
-    """
+    """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car."""
     check_settings(seed, theme)
     return sample_scene(np.random.default_rng(seed).spawn(2)[0], theme)
 
 
 def frames_of(seed: int, theme: Theme = "mixed") -> int:
-    """Return how many frames the drive of a seed has: with more, our car would drive out of its street.
-
-    Raises:
-        ConfigError: a negative seed, or an unknown theme.
-    """
+    """Return how many frames the drive of a seed has: with more, our car would drive out of its street."""
     check_settings(seed, theme)
     speed_m_s = sample_street_plan(np.random.default_rng(seed).spawn(2)[0], theme).speed_m_s
     return min(FRAMES_AT_MOST, 1 + int(ROAD_M / (speed_m_s * FRAME_S))) if speed_m_s else FRAMES_AT_MOST
 
 
 def check_settings(seed: int, theme: Theme, frame: int = 0, wet: float = 0.0) -> None:
-    """Refuse what cannot be simulated.
-
-    Raises:
-        ConfigError: a negative seed, an unknown theme, or a frame or a wetness out of its bounds. Those of a frame are
-            the street's: see :func:`frames_of`.
-    """
+    """Refuse what cannot be simulated."""
     if not 0 <= frame < FRAMES_AT_MOST:
         raise ConfigError(f"the frame {frame}", f"a frame from 0 to {FRAMES_AT_MOST - 1}", "choose another frame")
     if not 0 <= wet <= 1:  # also refuses NaN

@@ -39,8 +39,6 @@ def edges(
 
     Args:
         range_m: range of each pixel; infinite for no hit.
-        left_m: range of the pixel to the left.
-        right_m: range of the pixel to the right.
         edge_share: relative bend of inverse range that makes an edge.
     """
     inverse, left, right = (1 / a for a in (range_m, left_m, right_m))
@@ -73,7 +71,6 @@ def detect_echoes(
         rays: origins and directions of the beams.
         first: first hits of the central rays.
         edge: True for beams that are cast in their full width.
-        model: parameters of the raydrop model.
     """
     power = _power(surfaces, first, model)
     echoes = Echoes(power, first.range_m.copy(), first.triangle.copy(), first.cos_incidence.copy())

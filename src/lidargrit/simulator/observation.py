@@ -76,11 +76,7 @@ class Observation:
     fired_s: Float32[np.ndarray, "H W"] | None = None
 
     def scan(self, source: str) -> Scan:
-        """Return the points that came back in the firing order of KITTI's files.
-
-        Raises:
-            ScanError: not one point came back.
-        """
+        """Return the points that came back in the firing order of KITTI's files."""
         x, y = self.directions[..., 0], self.directions[..., 1]
         turn = np.arctan2(-y, -x)  # from -pi to pi, rising as the azimuth does from 0 to 2 pi
         # Rows are two runs already, which a stable sort joins in one pass.
@@ -108,9 +104,6 @@ class Observation:
 
         Args:
             limits_m: nearest and farthest range of a surface, in metres.
-
-        Raises:
-            ScanError: no surface at all.
         """
         within = (self.clean_range_m >= limits_m[0]) & (self.clean_range_m <= limits_m[1]) & ~self.blocked
         marks = mark(torch.from_numpy(self.return_mask), torch.from_numpy(self.reflectance)).numpy()

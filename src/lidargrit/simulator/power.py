@@ -56,9 +56,6 @@ class RaydropModel:
             films of water darken rough ground.
         wet_gloss: strength of the mirror-like lobe of soaked ground. Assumed: 0.02, as Fresnel's law has it for water.
         materials: reflection properties of all materials.
-
-    Raises:
-        ConfigError: a number with which no scan can be simulated, or tables of lasers that differ in length.
     """
 
     least_power: float = 2.5e-6
@@ -281,7 +278,6 @@ def reflectance(
         specular: light that the surface sends back besides, by gloss and retroreflection.
         level: natural log of power over the least power.
         chance: relative error of this reading.
-        model: parameters of the raydrop model.
     """
     full = scattered * (1 + chance) + np.float32(0.5) * specular
     seen = (level - np.float32(model.dim_level)) * np.float32(1 / (model.bright_level - model.dim_level))

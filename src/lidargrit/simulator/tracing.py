@@ -85,7 +85,6 @@ class Tracer:
         """Find the first hit of every ray.
 
         Args:
-            origins_m: origins of the rays.
             directions: unit direction vectors of the rays.
         """
         if len(directions) == 0:
@@ -112,7 +111,6 @@ class Tracer:
         """Follow rays that met a pane to what stands behind it, through a few panes at most.
 
         Args:
-            origins_m: origins of the rays.
             directions: unit direction vectors of the rays.
             first: first hit of each ray; a ray that hits no glass ends there.
             passes: share of light that passes each triangle; the last entry is for NOTHING.

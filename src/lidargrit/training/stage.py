@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -58,7 +59,14 @@ class StageTraining:
     plot: Callable[[Objective, Path], None] | None = None
     deadline_s: float = math.inf
 
-    def __post_init__(self) -> None:
+    def begun(self) -> Self:
+        """Launch its processes, read its checkpoint and open its log, and return it ready to run.
+
+        Raises:
+            ConfigError: settings that the objective cannot follow.
+            CheckpointError: a checkpoint of other weights.
+            TrainingError: processes that found different checkpoints.
+        """
         self.engine, self.optimiser = begin_training(self.objective, self.config)
         self.average = WeightAverage(self.objective, self.config.average_over_scans)
         self.scans_seen = 0
@@ -74,6 +82,7 @@ class StageTraining:
             )
         self._lacks_validation = False
         self.engine.by_first(self._begin)
+        return self
 
     @property
     def checkpoint(self) -> Path:

@@ -32,9 +32,6 @@ def write_png(figure: "Figure", path: Path) -> None:
 
     Titles that hold names of files, sensors or sets have ``parse_math=False``: between two dollar signs matplotlib
     would take them for formulas. Of letters that its font lacks, as in many languages, it draws boxes.
-
-    Raises:
-        OutputError: the picture cannot be written.
     """
     with atomic_path(path) as unfinished, warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing from")

@@ -33,12 +33,7 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
     rows where rows are of one kind.
 
     Args:
-        scores: scores of curves.
         title: title of the whole picture.
-
-    Raises:
-        ConfigError: no score.
-        OutputError: the picture cannot be written.
     """
     if not scores:
         raise ConfigError("no curve", "at least one", "compare some scans first")

@@ -163,11 +163,9 @@ def write_results_page(
     """Write the page ``demo.html`` into a run's folder.
 
     Args:
-        generator: a generator over tokens.
         kind: kind of the scans: "real" or "simulated".
         val: held-out scans; the page follows the first of them.
         samples: scans that the generator sampled.
-        errors: errors of reconstruction.
         card: scores of the samples against training scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.

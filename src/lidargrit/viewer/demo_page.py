@@ -60,7 +60,6 @@ class DemoPage:
 
     Args:
         kind: kind of the scans: "real" or "simulated".
-        name: name of the scan that the page follows.
         scan: a batch of this one scan; the model was not trained on it.
         tokens: tokens of the scan.
         decoded: ranges and probabilities of a return, decoded from the tokens.
@@ -92,11 +91,7 @@ class DemoPage:
 
 
 def write_demo_page(demo: DemoPage, path: Path) -> None:
-    """Write the page; it needs no network and no other file.
-
-    Raises:
-        OutputError: the page cannot be written.
-    """
+    """Write the page; it needs no network and no other file."""
     write_text(path, page(demo))
 
 

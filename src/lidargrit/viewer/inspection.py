@@ -33,9 +33,6 @@ def plot_inspection(inspection: Inspection, path: Path) -> None:
 
     Args:
         inspection: result of inspecting one scan.
-
-    Raises:
-        OutputError: the picture cannot be written.
     """
     figure = Figure(figsize=(14, 11), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)

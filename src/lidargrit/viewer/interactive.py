@@ -60,10 +60,6 @@ def write_page(sets: Sequence[ScanSet], path: Path) -> None:
 
     Args:
         sets: 1 to 8 sets of scans; the i-th scans of all sets are shown together.
-
-    Raises:
-        ConfigError: no set, or too many.
-        OutputError: the page cannot be written.
     """
     write_text(path, page(sets))
 

@@ -51,11 +51,6 @@ def plot_comparison(
             :meth:`lidargrit.scans.types.ScanBits.surprise`.
         filled: True for pixels whose point a model filled in, by group; they have another colour in the return mask and
             in the bird's-eye view.
-
-    Raises:
-        ConfigError: no group, no or too many images in one, a limit of range that is not positive, or fewer labels
-            than scans.
-        OutputError: the picture cannot be written.
     """
     _check(groups, max_range_m)
     rows = [(index, name) for index in range(max(map(len, groups.values()))) for name in groups]

@@ -47,9 +47,6 @@ def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
     Args:
         card: scores and facts of the evaluation.
         pair: the two sets of scans that were compared.
-
-    Raises:
-        OutputError: the page cannot be written.
     """
     write_text(path, page(card, pair))
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, ScanError, no_usable_scan
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
@@ -68,12 +68,6 @@ def load_scan_sets(
         all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
             with those that its image keeps. It has no effect if the settings give a number of columns, beside samples
             and runs, nor with a ``sensor``.
-
-    Raises:
-        ConfigError: no source.
-        UsageError: runs, and a later seed of theirs is above the largest one.
-        DataError: no usable scan in a source.
-        ScanError: a scan that cannot be used, unless such scans are skipped.
     """
     settings = settings or ScanSettings()
     config = settings.data
@@ -163,7 +157,7 @@ def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, con
             continue
         names.append(dataset.name(index))
     if not images:
-        raise DataError(f"no usable scan in {source.text}", "at least one", "see the messages above")
+        raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
     known = any(one is not None for one in filled)
     return ScanSet(source.text, RangeImage.stack(images), tuple(names), filled=marks if known else None)

@@ -19,9 +19,6 @@ def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
 
     Args:
         fit: fitted sensor with its residuals.
-
-    Raises:
-        OutputError: the picture cannot be written.
     """
     figure = Figure(figsize=(14.0, 9.0), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)

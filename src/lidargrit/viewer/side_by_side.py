@@ -37,11 +37,6 @@ def view(
         settings: sensor that scans are imaged with, and settings of reading them.
         surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
             the return mask; none if empty.
-
-    Raises:
-        ConfigError: too few or too many scans, or no source.
-        LidarGritError: a source that cannot be used.
-        OutputError: the file cannot be written.
     """
     is_page = out.suffix.lower() == ".html"
     at_most = PAGE_SCANS_AT_MOST if is_page else SCANS_AT_MOST

@@ -29,7 +29,6 @@ class SplitScheme:
     """One division of a data set into parts, as a paper or program defines it.
 
     Args:
-        source: publication or program that defines it.
         leak: one sentence on what the parts share but should not, for everyone who compares scores on them.
         parts: sequences of each part: train, val, test.
     """
@@ -205,11 +204,7 @@ class Window:
     indices: tuple[int, ...]
 
     def scans(self) -> list[Scan]:
-        """Read the scans, each with its time, and its pose where that is known.
-
-        Raises:
-            ScanError: the file of a scan cannot be used.
-        """
+        """Read the scans, each with its time, and its pose where that is known."""
         return [self._scan(at) for at in self.indices]
 
     def _scan(self, index: int) -> Scan:

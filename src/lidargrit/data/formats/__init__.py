@@ -153,11 +153,7 @@ def stem(path: Path) -> str:
 
 
 def recognise(path: Path) -> type[ScanFormat]:
-    """Return the format of a file, by its name and, where several formats share an ending, by what is in it.
-
-    Raises:
-        ScanError: no format has this ending, or there is no file to look at.
-    """
+    """Return the format of a file, by its name and, where several formats share an ending, by what is in it."""
     named = candidates(path)
     open_file(path, named[0].title if named else "a file of a scan").close()
     if not named:
@@ -185,9 +181,6 @@ def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse"
     Args:
         index: number of the scan in the file, from 0.
         bad_points: ``drop`` removes points with NaN or infinite coordinates and points at the origin.
-
-    Raises:
-        ScanError: the file cannot be used; says what is wrong and what to do.
     """
     form = recognise(Path(path))
     if index:  # counting reads a whole recording
@@ -244,11 +237,7 @@ def scan_of(
 
 
 def open_file(path: Path, wanted: str) -> BufferedReader:
-    """Open a file to read its bytes.
-
-    Raises:
-        ScanError: it is not there, not a file or unreadable.
-    """
+    """Open a file to read its bytes."""
     try:
         if not path.is_file():  # opening a pipe or a device would hang
             what = "not a file" if path.exists() else "not there"
@@ -259,11 +248,7 @@ def open_file(path: Path, wanted: str) -> BufferedReader:
 
 
 def read_bytes(path: Path, at_most: int, wanted: str) -> bytes:
-    """Read a whole file of limited size.
-
-    Raises:
-        ScanError: it is not a file, empty, unreadable or larger.
-    """
+    """Read a whole file of limited size."""
     with open_file(path, wanted) as file:
         try:
             size = os.fstat(file.fileno()).st_size

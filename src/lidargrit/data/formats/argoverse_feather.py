@@ -101,11 +101,7 @@ class ArgoverseFeather(ScanFormat):
 
     @classmethod
     def write(cls, path: Path, scan: Scan) -> None:
-        """Write a scan of 32 rings as a sweep of the upright sensor at its published pose.
-
-        Raises:
-            OutputError: points without rings, or rings that a VLP-32C does not have; no pyarrow.
-        """
+        """Write a scan of 32 rings as a sweep of the upright sensor at its published pose."""
         if scan.ring is None or not 0 <= int(scan.ring.min()) <= int(scan.ring.max()) < _LASERS:
             raise OutputError(
                 f"{scan.source}, whose points have {'no' if scan.ring is None else 'other'} rings",

@@ -10,12 +10,11 @@ import numpy as np
 
 from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, first_bytes, read_bytes
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
-    REFLECTANCE_RULE,
+    ColumnFormat,
     check_lines,
-    columns_of,
     plain_text,
     scan_of_columns,
 )
@@ -27,7 +26,7 @@ _HEADER_BYTES = 4096
 _SEPARATORS = (",", ";", "\t", " ")
 
 
-class CsvTable(ScanFormat):
+class CsvTable(ColumnFormat):
     """Text with a first line of names, such as ``x,y,z,intensity``; separated by commas, semicolons, tabs or blanks.
 
     Names may stand in quotation marks and in capitals, and "#" or "//" before the first of them. Numbers have a decimal
@@ -36,8 +35,6 @@ class CsvTable(ScanFormat):
 
     title = "table of text with a header (.csv)"
     suffixes = (".csv",)
-    reflectance = REFLECTANCE_RULE
-    keeps = ("reflectance", "ring", "label")
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -80,11 +77,6 @@ class CsvTable(ScanFormat):
         if not 1 <= len(table) <= POINTS_AT_MOST:
             raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
         return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points, names)
-
-    @classmethod
-    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
-        return columns_of(scan)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

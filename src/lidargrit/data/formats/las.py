@@ -4,6 +4,7 @@ import struct
 import warnings
 from collections.abc import Mapping
 from datetime import date
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,11 @@ import numpy as np
 
 from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, read_bytes
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, damaged, read_bytes
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
-    REFLECTANCE_RULE,
+    ColumnFormat,
+    begins_as,
     columns_of,
     scan_of_columns,
 )
@@ -36,7 +38,7 @@ _INTENSITY_STEPS = 65_535  # 16 bits, as the standard wants them
 _WRITTEN_ON = date(2000, 1, 1)  # the same scan gives the same bytes on every day
 
 
-class Las(ScanFormat):
+class Las(ColumnFormat):
     """LAS 1.0 to 1.4; compressed files (LAZ) have to be unpacked first.
 
     Reflectance is LAS's intensity, and none where all of it is 0, which is how LAS says so. Files that this program
@@ -50,24 +52,18 @@ class Las(ScanFormat):
 
     title = "LAS (surveying)"
     suffixes = (".las",)
-    reflectance = REFLECTANCE_RULE
-    keeps = ("reflectance", "ring", "label")
     extra = "las"
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether a file begins with a header of uncompressed LAS."""
-        try:
-            _check_header(first_bytes(path, _HEADER_BYTES_14), None, path)
-        except ScanError:
-            return False
-        return True
+        return begins_as(path, _HEADER_BYTES_14, partial(_check_header, None))
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
         data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
-        _check_header(data[:_HEADER_BYTES_14], len(data), path)
+        _check_header(len(data), data[:_HEADER_BYTES_14], path)
         try:
             import laspy  # noqa: PLC0415  an optional part
         except ImportError:
@@ -90,11 +86,7 @@ class Las(ScanFormat):
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write columns to a new file.
-
-        Raises:
-            OutputError: laspy is not installed, or a coordinate beyond 214 km.
-        """
+        """Write columns to a new file."""
         try:
             import laspy  # noqa: PLC0415  an optional part
         except ImportError:
@@ -141,7 +133,7 @@ def _steps(reflectance: np.ndarray) -> np.ndarray:
     return (_INTENSITY_STEPS * reflectance.astype(np.float64).clip(0, 1)).round().astype(np.uint16)
 
 
-def _check_header(header: bytes, size: int | None, path: Path) -> None:
+def _check_header(size: int | None, header: bytes, path: Path) -> None:
     """Refuse a header that asks for more than the file has; a size of None is not known yet."""
     if len(header) < _HEADER_BYTES or header[:4] != b"LASF" or header[24] != 1 or header[25] > 4:
         raise ScanError(f"{path}, which is no LAS file", _FORMAT, "convert it, or download it again")

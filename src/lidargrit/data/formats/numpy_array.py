@@ -11,11 +11,10 @@ import numpy as np
 from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array, read_member
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, open_file, read_bytes
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, damaged, first_bytes, open_file, read_bytes
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
-    REFLECTANCE_RULE,
-    columns_of,
+    ColumnFormat,
     scan_of_columns,
 )
 from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
@@ -33,7 +32,7 @@ _UNNAMED = "arr_0"  # as numpy calls an array that is saved without a name
 _POINTS = ("points", "xyz", "points_xyz_m")
 
 
-class NumpyArray(ScanFormat):
+class NumpyArray(ColumnFormat):
     """Arrays as numpy saves them; objects, which are code, are never loaded.
 
     An ``.npy`` holds a row of x, y, z for every point, and reflectance and ring if the rows are longer; a fourth number
@@ -46,8 +45,6 @@ class NumpyArray(ScanFormat):
 
     title = "NumPy array (.npz, .npy)"
     suffixes = (".npz", ".npy")
-    reflectance = REFLECTANCE_RULE
-    keeps = ("reflectance", "ring", "label")
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -86,11 +83,6 @@ class NumpyArray(ScanFormat):
     def companions(path: Path) -> tuple[Path, ...]:
         """Return the marks of filled points beside an ``.npy``; an ``.npz`` holds them itself."""
         return (marks_file(path),) if path.suffix.lower() == ".npy" else ()
-
-    @classmethod
-    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
-        return columns_of(scan)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

@@ -84,11 +84,7 @@ class NuscenesBin(ScanFormat):
 
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return the columns of a scan of 32 rings in the axes of the file, intensity 0 if it has no reflectance.
-
-        Raises:
-            OutputError: points without rings, or rings that an HDL-32E does not have.
-        """
+        """Return the columns of a scan of 32 rings in the axes of the file, intensity 0 if it has no reflectance."""
         if scan.ring is None or not 0 <= int(scan.ring.min()) <= int(scan.ring.max()) < _LASERS:
             raise OutputError(
                 f"{scan.source}, whose points have {'no' if scan.ring is None else 'other'} rings",

@@ -86,9 +86,6 @@ def sensor_of(path: Path) -> SensorModel:
     Args:
         path: the .json, or the .pcap beside it.
 
-    Raises:
-        ScanError: the file cannot be read, or is no metadata of an Ouster sensor.
-
     Source:
         Ouster's metadata: beam_altitude_angles and beam_azimuth_angles in degrees, the latter clockwise. Limits are
         those of our model of the same line, if there is one, and else the widest of any Ouster sensor.

@@ -2,18 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from io import BufferedReader, BytesIO
 from pathlib import Path
 
+import lzf
 import numpy as np
 
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, damaged, first_bytes, read_bytes
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, damaged, read_bytes
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
-    REFLECTANCE_RULE,
-    columns_of,
+    ColumnFormat,
+    begins_as,
     scan_of_columns,
     text_rows,
     whole_number,
@@ -26,7 +26,7 @@ _ROW_BYTES_AT_MOST = 4096  # real ones take 12 to 48; histograms of features up 
 _SIZES = {"F": (4, 8), "U": (1, 2, 4, 8), "I": (1, 2, 4, 8)}
 
 
-class Pcd(ScanFormat):
+class Pcd(ColumnFormat):
     """Point Cloud Data, version 0.7 and its forerunners; ordered clouds too, whose placeholders are NaN.
 
     Fields are found by their names: x, y, z, and if they are there reflectance (or reflectivity, intensity,
@@ -38,17 +38,11 @@ class Pcd(ScanFormat):
 
     title = "PCD (Point Cloud Library)"
     suffixes = (".pcd",)
-    reflectance = REFLECTANCE_RULE
-    keeps = ("reflectance", "ring", "label")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether a file begins with a header of PCD."""
-        try:
-            _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
-        except ScanError:
-            return False
-        return True
+        return begins_as(path, _HEADER_BYTES_AT_MOST, _Header.parse)
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -65,20 +59,25 @@ class Pcd(ScanFormat):
         )
 
     @classmethod
-    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
-        return columns_of(scan)
-
-    @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new binary file."""
-        from pypcd4.pypcd4 import Encoding, PointCloud  # noqa: PLC0415  for quick starts of what reads other files
-
-        cloud = PointCloud.from_points(
-            list(columns.values()), list(columns), [values.dtype for values in columns.values()]
-        )
+        rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
+        kinds = {"f": "F", "u": "U", "i": "I"}
+        lines = {
+            "VERSION": "0.7",
+            "FIELDS": " ".join(columns),
+            "SIZE": " ".join(f"{values.dtype.itemsize}" for values in columns.values()),
+            "TYPE": " ".join(kinds[values.dtype.kind] for values in columns.values()),
+            "COUNT": " ".join("1" for _ in columns),
+            "WIDTH": f"{len(rows)}",
+            "HEIGHT": "1",
+            "VIEWPOINT": "0.0 0.0 0.0 1.0 0.0 0.0 0.0",
+            "POINTS": f"{len(rows)}",
+            "DATA": "binary",
+        }
+        header = "".join(f"{key} {words}\n" for key, words in lines.items())
         with atomic_path(path) as temporary:
-            cloud.save(temporary, Encoding.BINARY)
+            temporary.write_bytes(header.encode() + rows.tobytes())
 
 
 @dataclass(frozen=True)
@@ -119,9 +118,9 @@ class _Header:
         return sum(size * count for size, count in zip(self.sizes, self.counts, strict=True))
 
     def column_names(self) -> list[str]:
-        """Name every value of a point, as pypcd4 does it: "f1", or "f1__0000", "f1__0001" where a field has several."""
+        """Name every value of a point: "f1", or "f1.0", "f1.1" where a field has several."""
         return [
-            f"f{index}" if count == 1 else f"f{index}__{part:04d}"
+            f"f{index}" if count == 1 else f"f{index}.{part}"
             for index, count in enumerate(self.counts)
             for part in range(count)
         ]
@@ -133,22 +132,6 @@ class _Header:
             if count == 1:
                 columns.setdefault(field, f"f{index}")
         return columns
-
-    def canonical(self) -> bytes:
-        """Return a header that any reader understands, without the file's own names and liberties."""
-        lines = {
-            "VERSION": ("0.7",),
-            "FIELDS": [f"f{index}" for index in range(len(self.fields))],
-            "SIZE": self.sizes,
-            "TYPE": self.types,
-            "COUNT": self.counts,
-            "WIDTH": (self.points,),
-            "HEIGHT": (1,),
-            "VIEWPOINT": (0, 0, 0, 1, 0, 0, 0),
-            "POINTS": (self.points,),
-            "DATA": (self.data,),
-        }
-        return "".join(f"{key} {' '.join(map(str, values))}\n" for key, values in lines.items()).encode()
 
 
 def _points(words: dict[str, list[str]], path: Path) -> int:
@@ -179,24 +162,33 @@ def _entries(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
 
 
 def _binary(header: _Header, body: bytes, path: Path) -> dict[str, np.ndarray]:
-    wanted_bytes = there = header.row_bytes * header.points
-    if header.data == "binary":
-        there = len(body)
-    elif header.data == "binary_compressed" and len(body) >= 8:
+    """Return the fields of one value, of rows or, where they are compressed, of one field after the other."""
+    wanted_bytes, packed = header.row_bytes * header.points, header.data == "binary_compressed"
+    if not (header.data == "binary" or (packed and len(body) >= 8)):
+        raise _refused(f"{len(body)} bytes of DATA {header.data[:20]!r}", path)
+    if packed:
         packed_bytes, unpacked_bytes = np.frombuffer(body, "<u4", 2).tolist()
         if packed_bytes > len(body) - 8 or unpacked_bytes != wanted_bytes:  # before room is made for them
             raise _refused(f"{len(body) - 8} of {packed_bytes} bytes, {unpacked_bytes} unpacked", path)
-    else:
-        raise _refused(f"{len(body)} bytes of DATA {header.data[:20]!r}", path)
-    if there < wanted_bytes:
-        raise _refused(f"{there} bytes of points instead of {wanted_bytes}", path)
-    from pypcd4.pypcd4 import PointCloud  # noqa: PLC0415  for quick starts of what reads other files
-
-    try:
-        cloud = PointCloud.from_fileobj(BufferedReader(BytesIO(header.canonical() + body)))
-    except Exception as error:  # the library meets a damaged file with whatever it stumbles over
-        raise damaged(path, _FORMAT, error) from None
-    return {name: cloud.pc_data[name] for name in header.column_names()}
+        try:
+            body = lzf.decompress(body[8 : 8 + packed_bytes], wanted_bytes)
+        except ValueError as error:
+            raise damaged(path, _FORMAT, error) from None
+    if len(body) < wanted_bytes:
+        raise _refused(f"{len(body)} bytes of points instead of {wanted_bytes}", path)
+    fields = [
+        (f"f{index}", f"<{kind.lower()}{size}", (count,))
+        for index, (kind, size, count) in enumerate(zip(header.types, header.sizes, header.counts, strict=True))
+    ]
+    if not packed:
+        rows = np.frombuffer(body, np.dtype(fields), header.points)
+        return {name: rows[name][:, 0] for name in header.single_fields().values()}
+    ends = np.cumsum([header.points * size * count for size, count in zip(header.sizes, header.counts, strict=True)])
+    starts = dict(zip([name for name, _, _ in fields], [0, *ends.tolist()], strict=False))
+    kinds = {name: kind for name, kind, _ in fields}
+    return {
+        name: np.frombuffer(body, kinds[name], header.points, starts[name]) for name in header.single_fields().values()
+    }
 
 
 def _refused(what: str, path: Path) -> ScanError:

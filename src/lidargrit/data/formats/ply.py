@@ -9,12 +9,12 @@ import numpy as np
 
 from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, read_bytes
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
-    REFLECTANCE_RULE,
+    ColumnFormat,
+    begins_as,
     check_lines,
-    columns_of,
     plain_text,
     scan_of_columns,
     text_rows,
@@ -51,7 +51,7 @@ _TYPE_NAMES = {kind: name for name, kind in reversed(_TYPES.items())}  # of what
 _OF_CARLA = re.compile(rb"property float32 (I|CosAngle)\s")  # of its LiDAR and its semantic LiDAR
 
 
-class Ply(ScanFormat):
+class Ply(ColumnFormat):
     """Polygon files, of which only the vertices are read.
 
     Properties are found by their names, with or without the "scalar_" that CloudCompare puts before them: x, y, z, and
@@ -64,17 +64,11 @@ class Ply(ScanFormat):
 
     title = "PLY (polygon file)"
     suffixes = (".ply",)
-    reflectance = REFLECTANCE_RULE
-    keeps = ("reflectance", "ring", "label")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether a file begins with a header of PLY."""
-        try:
-            _Header.parse(first_bytes(path, _HEADER_BYTES_AT_MOST), path)
-        except ScanError:
-            return False
-        return True
+        return begins_as(path, _HEADER_BYTES_AT_MOST, _Header.parse)
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -89,11 +83,6 @@ class Ply(ScanFormat):
             raise _refused(first_words(error), path) from None
         scan = scan_of_columns(columns, path, bad_points)
         return _right_handed(scan) if _OF_CARLA.search(data[: header.end]) else scan
-
-    @classmethod
-    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
-        return columns_of(scan)
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:

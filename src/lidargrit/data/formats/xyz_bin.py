@@ -65,11 +65,7 @@ class XyzBin(ScanFormat):
 
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
-        """Return the coordinates of a scan.
-
-        Raises:
-            OutputError: a coordinate beyond 1,000 m, which would not be read back.
-        """
+        """Return the coordinates of a scan."""
         farthest_m = float(scan.points_xyz_m.abs().max())
         if farthest_m > _FARTHEST_M:
             what = f"a coordinate of {farthest_m:g} m in {scan.source}, to write as {cls.title}"

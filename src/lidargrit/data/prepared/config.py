@@ -85,9 +85,6 @@ class ScanSettings:
             settings: words of the form data.NAME=VALUE.
             options: values by the names of :class:`DataConfig`; None or "" for those that the user did not give. They
                 come after the words.
-
-        Raises:
-            ConfigError: no such setting, or a value out of its bounds.
         """
         words = [*settings, *(f"data.{name}={value}" for name, value in options.items() if value not in (None, ""))]
         owner, cure = "reading scans", "name one with data. before it, as data.projection=spherical"

@@ -22,7 +22,6 @@ class Imaging:
     """Settings by which the scans of one set become images.
 
     Args:
-        sensor: sensor of the images, with the projection that fits the scans.
         config: settings of the projection, with the variant that fits the scans.
         notes: sentences on what was chosen in place of what the sensor and the settings say, and on what was
             left out of the files.

@@ -12,7 +12,7 @@ from typing import Any
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
-from lidargrit.core.errors import DataError, OutputError, counted_scans
+from lidargrit.core.errors import DataError, OutputError, counted_scans, no_usable_scan
 from lidargrit.core.files import claim_folder, is_taken, remove_partials, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
@@ -59,10 +59,6 @@ def prepare(
 
     Returns:
         the folder, complete.
-
-    Raises:
-        OutputError: the folder holds something else, or images of scans or settings that have changed since.
-        ScanError: a scan that cannot be used; names it.
     """
     sensor = sensor or config.load_sensor()
     rank, world_size = rank_and_world_size(rank, world_size)
@@ -95,7 +91,6 @@ class Prepared:
     """Size and content of a prepared folder.
 
     Args:
-        images: number of images.
         rows: number of rows of an image.
         columns: number of fine columns of an image.
         size: size of all shards, in bytes.
@@ -138,9 +133,6 @@ def prepare_and_describe(
     Args:
         source, dataset, config, folder, rank, world_size: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
-
-    Raises:
-        OutputError, ScanError: as for :func:`prepare`.
     """
     begun = time.monotonic()
     imaging = choose_imaging(source, dataset, config.load_sensor(), config)
@@ -156,7 +148,7 @@ def prepare_and_describe(
     for remark in images.remarks():
         reporting.message(remark)
     if not len(images):
-        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+        raise no_usable_scan(source)
     size = sum(path.stat().st_size for path in folder.glob("*.shard"))
     shape = images.sensor.height, images.sensor.width
     return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))

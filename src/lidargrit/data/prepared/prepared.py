@@ -97,9 +97,6 @@ class PreparedFolder:
 
     Args:
         location: path on this machine, or a URL that fsspec opens, such as s3://bucket/scans.
-
-    Raises:
-        DataError: fsspec cannot open the URL.
     """
 
     def __init__(self, location: str) -> None:
@@ -114,11 +111,7 @@ class PreparedFolder:
                 raise DataError(f"{location} ({error})", "a URL that fsspec can open", "check it") from None
 
     def open(self, name: str) -> Bytes:
-        """Open a file, of which pieces can then be read.
-
-        Raises:
-            DataError: the file cannot be read.
-        """
+        """Open a file, of which pieces can then be read."""
         if not self._is_local:
             return _RemoteBytes(self._files, f"{self._root}/{name}", f"{self.location}/{name}")
         try:
@@ -134,9 +127,6 @@ class PreparedFolder:
         Args:
             kind: required type of the whole, dict or list.
             at_most: largest size, in bytes.
-
-        Raises:
-            DataError: the file cannot be read, or holds something else.
         """
         file = self.open(name)
         data, wanted = bytes(file.read(0, min(file.size, at_most + 1))), "what lidargrit prepare wrote"
@@ -199,9 +189,6 @@ class PreparedImages:
 
     Args:
         location: path of the folder, or its URL.
-
-    Raises:
-        DataError: the folder is not a prepared one, is not complete, or is damaged.
     """
 
     def __init__(self, location: str) -> None:
@@ -283,9 +270,6 @@ class PreparedImages:
         Args:
             variant: projection variant that is wanted. The reference's columns cannot be gathered into fewer: it rounds
                 points to the nearest column.
-
-        Raises:
-            DataError: images that were prepared for other rays, or projected in another way; says for which.
         """
         location, prepared, wanted = self._folder.location, self.sensor, sensor.fine()
         is_wider = variant == "exact" and has_fewer_columns(wanted, prepared)
@@ -314,9 +298,6 @@ class PreparedImages:
         Args:
             index: number of the image.
             verify: whether to compare the pixels with their fingerprint.
-
-        Raises:
-            DataError: the image is damaged.
         """
         shard, entry = self._entries[index]
         name = f"{self._folder.location}/{shard_name(shard)}"

@@ -73,11 +73,7 @@ class Bytes(Protocol):
     size: int
 
     def read(self, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes from ``start`` up to ``end``.
-
-        Raises:
-            DataError: they lie on another machine, which does not answer.
-        """
+        """Return the bytes from ``start`` up to ``end``."""
         ...
 
 
@@ -151,11 +147,7 @@ class ShardWriter:
         )
 
     def add_from(self, file: Bytes, name: str) -> None:
-        """Add all that another file of this class holds.
-
-        Raises:
-            DataError: the file is not whole.
-        """
+        """Add all that another file of this class holds."""
         entries, left_out = read_index(file, name)
         for entry in entries:
             blob = file.read(entry.offset, entry.end)
@@ -180,11 +172,7 @@ class ShardWriter:
 
 
 def read_index(file: Bytes, name: str) -> tuple[list[ShardEntry], dict[int, str]]:
-    """Return the entries of a shard's images, and for each scan that was left out the reason.
-
-    Raises:
-        DataError: the file is no whole shard.
-    """
+    """Return the entries of a shard's images, and for each scan that was left out the reason."""
     tail = bytes(file.read(max(0, file.size - _TAIL), file.size))
     length = int.from_bytes(tail[:8], "little")
     start = file.size - _TAIL - length
@@ -212,11 +200,7 @@ def read_index(file: Bytes, name: str) -> tuple[list[ShardEntry], dict[int, str]
 def read_image(
     file: Bytes, entry: ShardEntry, shape: tuple[int, int], step_m: float, name: str, verify: bool = False
 ) -> Pixels:
-    """Return the pixels of one image of a shard; ``verify`` compares them with their fingerprint.
-
-    Raises:
-        DataError: the image is damaged.
-    """
+    """Return the pixels of one image of a shard; ``verify`` compares them with their fingerprint."""
     blob = file.read(entry.offset, entry.end)
     of_range, of_reflectance = entry.range_bytes, entry.range_bytes + entry.reflectance_bytes
     try:

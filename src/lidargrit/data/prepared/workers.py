@@ -28,11 +28,7 @@ _KEEP_EVERY_S = 5.0  # what a killed process loses at most; a shard of real scan
 
 
 def make_shards(folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int) -> None:
-    """Make shards, in this process if one is enough, else in several.
-
-    Raises:
-        LidarGritError: what one of the processes met; the others are stopped.
-    """
+    """Make shards, in this process if one is enough, else in several."""
     total = sum(len(spec.scans_of(shard)) for shard in shards)
     workers = min(workers, len(shards))
     with reporting.progress("projecting scans", spec.num_scans, spec.num_scans - total) as progress:
@@ -54,10 +50,6 @@ def make_shard(
         shard: number of the shard.
         dataset: source of the scans.
         advance: function that receives the number of further scans done.
-
-    Raises:
-        ScanError: a scan that cannot be used, unless such scans are skipped.
-        DataError: the source no longer holds the scans that were planned.
     """
     wanted = evenly_spaced(spec.max_scans or len(dataset), len(dataset))
     if len(wanted) != spec.num_scans:

@@ -5,7 +5,7 @@ from functools import cached_property
 from pathlib import Path
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import DataError, LidarGritError, ScanError
+from lidargrit.core.errors import DataError, LidarGritError, ScanError, no_usable_scan
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import BadPoints
@@ -96,7 +96,6 @@ class DatasetSource(Source):
 
         Args:
             sensor: sensor of the images; the data set's own, with the configuration's columns, if not given.
-            config: settings of the projection.
         """
         return choose_imaging(self.text, self._dataset, sensor or config.imaged(self.sensor), config)
 
@@ -213,11 +212,7 @@ class RunSource(Source):
         return recorded_projection(self.folder)
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
-        """Refuse: scans have to be generated first.
-
-        Raises:
-            DataError: always.
-        """
+        """Refuse: scans have to be generated first."""
         cure = f"generate some first with: lidargrit sample {self.text} FOLDER"
         raise DataError(f"{self.text}, which holds {self.kind}", "scans or samples", cure)
 
@@ -326,7 +321,6 @@ def overlap(source: Source, images: RangeImages | None, reference: RangeImages) 
 
     Args:
         source: source of the set; of samples and runs, the training scans of the model count, too.
-        images: images of the set, where it holds any.
         reference: set that it is compared with.
     """
     own = Provenance() if images is None else images.provenance
@@ -359,4 +353,4 @@ def _require_some(text: str, prepared: PreparedImages) -> None:
     for remark in prepared.remarks():
         reporting.message(remark)
     if not len(prepared):
-        raise DataError(f"no usable scan in {text}", "at least one", "see the messages above")
+        raise no_usable_scan(text)

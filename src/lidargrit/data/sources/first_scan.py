@@ -19,9 +19,6 @@ def first_scan(text: str, config: DataConfig) -> tuple[Scan, str]:
 
     Returns:
         the scan, whose notes name those that were skipped; and the sensor of the data set, "" where none is known.
-
-    Raises:
-        ScanError: a scan that cannot be used.
     """
     skips = config.bad_scans == "skip"
     if Path(text).is_file() and not skips:

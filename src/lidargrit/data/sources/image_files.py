@@ -41,11 +41,7 @@ class ImageFileSource(Source):
 
     @property
     def sensor(self) -> SensorModel:
-        """Sensor that is taken for a folder of scans, if the first image has its size.
-
-        Raises:
-            ConfigError: another size, of which nothing tells where its rows look.
-        """
+        """Sensor that is taken for a folder of scans, if the first image has its size."""
         size, usual = _array(self._paths[0]).shape, load_sensor(Folder.sensor)
         if size == (usual.height, usual.width):
             return usual
@@ -69,12 +65,7 @@ class ImageFileSource(Source):
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none.
-
-    Raises:
-        DataError: range images beside other files or above further scans, or a name that is not UTF-8.
-        ScanError: the first of them is a mask.
-    """
+    """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none."""
     try:
         found = [path] if path.is_file() else natural_order(path.iterdir())
     except (OSError, ValueError):

@@ -17,10 +17,6 @@ class MemorySource(Source):
 
     Args:
         scans: points of each scan.
-        sensor: sensor that made them.
-
-    Raises:
-        DataError: no scan.
     """
 
     kind = "scans in memory"

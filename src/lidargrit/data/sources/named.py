@@ -53,18 +53,13 @@ class NamedScans(ABC):
 
     @abstractmethod
     def check_output(self, out: Path) -> None:
-        """Refuse a folder whose files would become scans of the source.
-
-        Raises:
-            OutputError: the folder is the source, or lies in it.
-        """
+        """Refuse a folder whose files would become scans of the source."""
 
 
 class PointScans(NamedScans):
     """Scans of a data set, by their own names.
 
     Args:
-        dataset: data set.
         max_scans: number of scans; 0 for all.
     """
 
@@ -111,7 +106,6 @@ class ImageScans(NamedScans):
     """Range images as scans.
 
     Args:
-        images: range images of the source.
         names: name of each.
         numbers: numbers of those that are taken.
     """
@@ -150,8 +144,6 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
     """Return the scans of a source: named as in their data set or as their image's file, else by their index.
 
     Args:
-        source: opened source.
-        config: number of scans.
         sensor: sensor of range images that do not name theirs; see :meth:`Source.images`.
     """
     if isinstance(source, DatasetSource):

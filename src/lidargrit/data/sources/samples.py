@@ -25,9 +25,6 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     Args:
         folder: folder that :func:`lidargrit.inference.samples.write_samples` wrote.
         count: largest number of scans, evenly spaced over the seeds; all if not given.
-
-    Raises:
-        DataError: no samples in the folder.
     """
     manifest = read_json(folder / MANIFEST)
     try:

@@ -13,11 +13,7 @@ def sensor_for(source: Source, name: str) -> SensorModel:
 
 
 def refuse_other_sensor(name: str, model: str, job: Job = "sample") -> None:
-    """Refuse the name of a sensor that is not a run's own, which its networks know alone; "" names none.
-
-    Raises:
-        ConfigError: a sensor with other rays.
-    """
+    """Refuse the name of a sensor that is not a run's own, which its networks know alone; "" names none."""
     if not name:
         return
     own, sensor = RunSource(model, locate(model, job)).sensor, load_sensor(name)

@@ -257,10 +257,6 @@ def update_together(metrics: Sequence[tuple[Metric[Any, Any], bool]], images: Ra
 
     Args:
         metrics: metrics, each with whether the images belong to its real set.
-        images: a batch of range images, or a single one.
-
-    Raises:
-        ConfigError: images of another size or other range limits than those that a metric has seen before.
 
     Example:
         >>> from lidargrit.evaluation.metrics import BevJsd, BevMmd

@@ -13,11 +13,7 @@ _STEPS = 50  # bins of 0.02, two of the hundredths that KITTI's files hold
 
 
 class ReflectanceHistogram(CurveMetric):
-    """Compare the histograms of reflectance of all returns.
-
-    Raises:
-        DataError: images without reflectance.
-    """
+    """Compare the histograms of reflectance of all returns."""
 
     title = "Distribution of reflectance"
     axis_label = "reflectance"

@@ -49,10 +49,6 @@ class SlicedWasserstein(ImageMetric):
             ``textbook`` is Karras et al.: directions of unit length, an aligned pyramid, and positions of its own for
             every image. These are sampled by a seed made of the image itself, its set and ``seed``, so that neither the
             order of images nor the number of processes matters; equal images of one set give equal patches.
-        seed: seed of patch positions and directions.
-
-    Raises:
-        ConfigError: images of fewer than 16 rows or columns, of a size that cannot be halved, or of two kinds.
 
     Source:
         Karras et al., Progressive growing of GANs, ICLR 2018, section 5; behaviour of hamedhaghighi/LidarGRIT@a3f86e7.
@@ -161,11 +157,7 @@ class SharedPositions:
 
 
 def num_levels(rows: int, columns: int) -> int:
-    """Return how many levels the pyramid has: halved for as long as 16 rows and columns are left.
-
-    Raises:
-        ConfigError: fewer than 16 rows or columns, or a size that cannot be halved as often.
-    """
+    """Return how many levels the pyramid has: halved for as long as 16 rows and columns are left."""
     if min(rows, columns) < _COARSEST:
         raise ConfigError(
             f"range images of {rows}x{columns}",

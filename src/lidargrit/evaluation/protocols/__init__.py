@@ -75,9 +75,6 @@ class Protocol:
 def load_protocol(name: str) -> Protocol:
     """Return a protocol by its name, with "-" or "_".
 
-    Raises:
-        UnknownNameError: no such protocol; names its nearest neighbours.
-
     Example:
         >>> load_protocol("lidargrit-kitti-360").num_scans
         5000

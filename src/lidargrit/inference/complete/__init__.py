@@ -27,9 +27,7 @@ class Model:
     """A generator that a user named, to complete scans by.
 
     Args:
-        name: word by which the user named it.
         generator: generator of a run, or a classical method.
-        sampling: settings by which it completes.
         folder: folder of its run; None for a classical method.
         projection: way in which points find their rows; ``sensor`` for the sensor's own, or what fits the points.
     """

@@ -35,9 +35,6 @@ class CompletedScan:
 
         Reflectance, ring and label are there where the scan has them; ``filled`` marks what was added, whose times are
         those of the points nearest to its rays.
-
-        Raises:
-            ScanError: every point was dropped.
         """
         own, added = replace(self.scan.select(self.kept), rows=None), self.filled
         if added is None:
@@ -71,8 +68,6 @@ def filled_scan(seen: InputScan, condition: Observed, images: RangeImage, hides:
 
     Args:
         seen: scan on its rays, which are several images of the model.
-        condition: observed part of each of these images.
-        images: the model's completion of each.
         hides: whether measured points outside the observed pixels are left out.
     """
     grid = seen.rays

@@ -7,8 +7,8 @@ from jaxtyping import Float64, Shaped
 from torch import Tensor
 
 from lidargrit.data import formats
-from lidargrit.data.export import IMAGE, TREE, writable_format, write_with_labels
 from lidargrit.data.formats import ScanFormat
+from lidargrit.data.scan_folder import IMAGE, TREE, writable_format, write_with_labels
 from lidargrit.inference.complete.cloud import CompletedScan
 from lidargrit.scans.columns import quantity_of
 from lidargrit.scans.file_rows import FileRows
@@ -41,9 +41,7 @@ def write_cloud(path: Path, kind: str, done: CompletedScan, form: type[ScanForma
     Of an added point, columns that a scan has no room for have the value of the measured point nearest to its ray.
 
     Args:
-        path: path of the new file.
         kind: name or ending of the wanted format; "" for the scan's own.
-        done: completed cloud.
         form: format of the scan's file; None if it was in none.
     """
     whole = done.whole()

@@ -30,11 +30,6 @@ def complete_scans(
 
     Returns:
         what was written, and how many points came in and went out.
-
-    Raises:
-        ConfigError: sensors whose rows hardly look the same ways.
-        UsageError: all pixels are observed, or a mask of another size.
-        ScanError: a scan that cannot be used, of another sensor, or without a return among the observed pixels.
     """
     config = config or DataConfig()
     reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)

@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, scan_seed
-from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
-from lidargrit.core.files import claim_folder, write_json
+from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.core.files import write_json
 from lidargrit.data.datasets.folder import SENSOR_FILE
-from lidargrit.data.export import IMAGE, TREE, KittiTree, check_names, claimed_scans, tell_labels_lost, write_array
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.scan_folder import IMAGE, TREE, KittiTree, ScanFolder, check_names, write_array
 from lidargrit.data.sources.image_files import PROBABILITY
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.clouds_to_files import suffix_of, write_cloud
@@ -106,28 +105,18 @@ def write_completions(
         task, output: work on each scan; number and kind of files.
         facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
         config: treatment of scans that cannot be used; nothing else of it is used.
-
-    Raises:
-        ConfigError: several completions by what completes a scan in one way.
-        OutputError: the folder holds something else, lies in the source, or cannot be written.
-        ScanError, DataError: a scan that cannot be used, no usable one, or two that would be one file.
     """
     inputs.check_output(out)
     files, facts = _files(inputs, str(facts["source"]), output), facts | _facts(model, output)
-    identities, left_out = {file: inputs.identity(index) for (index, _), file in files.items()}, set[int]()
-    missing = [job for job, file in files.items() if not (out / file).exists()]
-    jobs = _jobs(inputs, missing, model, task, output, left_out if config.bad_scans == "skip" else None)
+    identities = [inputs.identity(number // output.count) for number in range(len(files))]
+    folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans)
+    jobs = _jobs(inputs, folder, model, task, output)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, np.zeros(3, dtype=np.int64)
-    told_labels = False
-    with (
-        claim_folder(out),
-        claimed_scans(out / "completed.json", {**facts, "scans": identities}) as files_left_out,
-        reporting.progress("completing", len(files), len(files) - len(missing)) as progress,
-    ):
+    with folder.writing("completing") as progress:
         for batch in _batches(chain(first, jobs), model.generator.compute_batch):
             for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
-                file = files[job.index, job.turn]
+                file = files[job.index * output.count + job.turn]
                 if output.probability and job.turn == 0:
                     write_array(out / _probability_file(file), _return_share(model, job, output))
                 if sensor_file is None:
@@ -136,14 +125,11 @@ def write_completions(
                 else:
                     kept_labels, points = _write_cloud(out / file, sensor_file, output.format, task, job, images)
                     counts += points
-                told_labels = told_labels or tell_labels_lost(not kept_labels, file)
+                if not kept_labels:
+                    folder.tell_labels_lost(file)
                 progress.advance(1)
-        files_left_out.update(file for (index, _), file in files.items() if index in left_out)
-    if len(left_out) == len(inputs):
-        raise DataError("no usable scan", "at least one", "see the messages above")
     points_in, points_out, points_filled = counts.tolist()
-    scans = len(files) - len(left_out) * output.count
-    return Written(scans, points_in, points_out, points_filled, sensor_file)
+    return Written(folder.num_written, points_in, points_out, points_filled, sensor_file)
 
 
 def _write_cloud(
@@ -174,8 +160,8 @@ def _facts(model: Model, output: OutputConfig) -> dict[str, Any]:
     return made
 
 
-def _files(inputs: Inputs, source: str, output: OutputConfig) -> dict[tuple[int, int], str]:
-    """Return the name of each file below the folder, by the index of its scan and the number of the completion."""
+def _files(inputs: Inputs, source: str, output: OutputConfig) -> list[str]:
+    """Return the name of each file below the folder: all completions of the first scan, then of the next."""
     if len(inputs) * output.count > _FILES_AT_MOST:
         got = f"{output.count:,} completions of each of {len(inputs):,} scans"
         raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
@@ -188,38 +174,21 @@ def _files(inputs: Inputs, source: str, output: OutputConfig) -> dict[tuple[int,
     if taken := [name for name in names if name.endswith(PROBABILITY)]:
         got = f"a scan that would be {taken[0]}, as files of return probabilities are called"
         raise OutputError(got, "another name", "rename the scan, or choose another --format")
-    return {
-        (index, turn): _folder(turn, output.count) + name
-        for index, name in enumerate(names)
-        for turn in range(output.count)
-    }
+    return [_folder(turn, output.count) + name for name in names for turn in range(output.count)]
 
 
-def _jobs(
-    inputs: Inputs,
-    missing: Sequence[tuple[int, int]],
-    model: Model,
-    task: Task,
-    output: OutputConfig,
-    skipped: set[int] | None,
-) -> Iterator[_Job]:
-    """Read each scan of missing files once; note those that cannot be used in a set, or refuse them without one."""
-    last, job = -1, None
-    for index, turn in missing:
-        if index != last:
-            last, job = index, None
-            try:
-                scan = inputs.read(index, None if output.format == IMAGE else partial(task.see, model=model))
-                number = inputs.number(index)
-                condition = task.condition(scan, derive_seed(output.seed, number))
-                job = _Job(index, number, turn, scan, condition, inputs.form(index))
-            except ScanError as error:
-                if skipped is None:
-                    raise
-                reporting.message(f"left out: {error}")
-                skipped.add(index)
+def _jobs(inputs: Inputs, folder: ScanFolder, model: Model, task: Task, output: OutputConfig) -> Iterator[_Job]:
+    """Read each scan of missing files once."""
+    for index, files in groupby(folder.missing, lambda file: file // output.count):
+        job = None
+        with folder.leaving_out(*range(index * output.count, (index + 1) * output.count)):
+            scan = inputs.read(index, None if output.format == IMAGE else partial(task.see, model=model))
+            number = inputs.number(index)
+            condition = task.condition(scan, derive_seed(output.seed, number))
+            job = _Job(index, number, 0, scan, condition, inputs.form(index))
         if job is not None:
-            yield replace(job, turn=turn)
+            for file in files:
+                yield replace(job, turn=file % output.count)
 
 
 def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:

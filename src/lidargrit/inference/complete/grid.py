@@ -25,7 +25,6 @@ class RayGrid:
     fine column, so that each of these is an image like those it knows, and every column is in one of them.
 
     Args:
-        model: sensor of the model, whose width an image has.
         sensor: sensor of all rays: the model's rows, and ``phases`` times its columns.
         phases: number of images.
     """
@@ -39,7 +38,6 @@ class RayGrid:
         """Return the grid with about as many columns as a cloud has, and at most as many.
 
         Args:
-            model: sensor of the model.
             columns: number of columns in which the cloud's sensor fires; the model's fine ones where it is 0, unknown.
             first_edge_rad: azimuth at which the first of these columns begins; that of the model if not given.
         """

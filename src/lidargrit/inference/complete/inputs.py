@@ -135,12 +135,8 @@ class Inputs:
         """Read one scan; tell once if another sensor seems to have made it, and how many points have no pixel.
 
         Args:
-            index: index of the scan.
             see: function that brings a cloud to the rays that all of its points lie on; not given, it becomes one image
                 of the reader's sensor. A range image stays as it is.
-
-        Raises:
-            ScanError: a scan that cannot be used, or of another sensor.
         """
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
@@ -222,9 +218,6 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
         source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
-
-    Raises:
-        ConfigError: range images of other rays than the reader's sensor.
     """
     scans = named_scans(open_source(source, config.bad_points), config, reader.sensor)
     if isinstance(scans, ImageScans) and not scans.images.sensor.same_rays(reader.sensor):

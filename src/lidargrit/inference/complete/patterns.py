@@ -59,12 +59,7 @@ class Pattern:
         """Return the masks of the observed pixels of the images that one scan consists of.
 
         Args:
-            images: batch of range images of one scan.
             seed: seed of the pixels that ``pixels:SHARE`` chooses; each further image has others.
-
-        Raises:
-            UsageError: a mask of another size, or one by which all pixels are observed.
-            ScanError: no return of this scan is observed, or ``returns`` of a scan in which every pixel has one.
         """
         masks = torch.stack([self._mask(images[at], phase_seed(seed, at)) for at in range(len(images))])
         if self.text == "returns" and bool(masks.all()):

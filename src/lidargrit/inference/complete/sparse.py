@@ -19,14 +19,7 @@ _ROWS_AT_LEAST = 2
 
 @dataclass(frozen=True)
 class SparseReader(ScanReader):
-    """How the points of a sensor with few rows become an image of :attr:`sensor`, in which most rows are unknown.
-
-    Args:
-        source: sensor of the scans.
-
-    Raises:
-        ConfigError: hardly a row of the one sensor looks where a row of the other does.
-    """
+    """How the points of a sensor with few rows become an image of :attr:`sensor`, in which most rows are unknown."""
 
     source: SensorModel | None = None
 
@@ -123,11 +116,7 @@ class SparseReader(ScanReader):
 
 
 def observed_rows(scan: InputScan) -> Bool[Tensor, "H W"]:
-    """Return the pixels that a sparse scan covers: all of its rows, with a return or without.
-
-    Raises:
-        ScanError: a scan that was an image of all rows.
-    """
+    """Return the pixels that a sparse scan covers: all of its rows, with a return or without."""
     if scan.on_grid is None:
         raise ScanError(
             "a range image, which has no rows between its own",

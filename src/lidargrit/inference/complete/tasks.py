@@ -39,22 +39,14 @@ class Task(ABC):
         return RayGrid.fitting(model, *columns_fired(scan))
 
     def see(self, scan: Scan, model: Model) -> InputScan:
-        """Return a cloud on the rays that all of its points lie on.
-
-        Raises:
-            ScanError: a scan that cannot be used, or of another sensor.
-        """
+        """Return a cloud on the rays that all of its points lie on."""
         grid = self.grid(scan, model.sensor)
         reader = replace(self.reader(grid.sensor, model.projection_variant), projection=model.projection)
         return replace(reader.read(scan), grid=grid)
 
     @abstractmethod
     def condition(self, seen: InputScan, seed: int) -> Observed:
-        """Return what is known of each image that a scan consists of, the random part of it by a seed.
-
-        Raises:
-            ScanError, UsageError: a scan of which nothing or everything is known.
-        """
+        """Return what is known of each image that a scan consists of, the random part of it by a seed."""
 
     @abstractmethod
     def result(self, seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
@@ -111,11 +103,7 @@ class AddRows(Task):
     verb: ClassVar[str] = "upsample"
 
     def reader(self, sensor: SensorModel, variant: ProjectionVariant) -> ScanReader:
-        """Return one that knows both sensors.
-
-        Raises:
-            ConfigError: sensors whose rows hardly look the same ways.
-        """
+        """Return one that knows both sensors."""
         return SparseReader(sensor, variant, source=self.scans_sensor)
 
     def grid(self, scan: Scan, model: SensorModel) -> RayGrid:
@@ -177,14 +165,10 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
         scan: points in the sensor's frame.
         model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
         task: the work on it; every ray without a point is filled in if not given.
-        seed: seed of what is sampled.
 
     Returns:
         measured points bit for bit and in their order, and those that were added;
         :meth:`CompletedScan.whole` gives them as one scan.
-
-    Raises:
-        ScanError: a scan that cannot be used, or of another sensor.
 
     Example:
         >>> import lidargrit

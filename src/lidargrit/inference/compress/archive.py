@@ -70,10 +70,6 @@ def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = 
     Args:
         header: facts that all scans have in common, as JSON.
         chosen: options that say which scans these are, as JSON, to be kept beside an unfinished file.
-
-    Raises:
-        OutputError: the folder cannot be written to, another process is writing, or an unfinished file has another
-            header or was begun with other options.
     """
     folder = path.with_name(path.name + UNFINISHED)
     scans, index, options = folder / "scans", folder / "index", folder / "options.json"
@@ -109,10 +105,6 @@ class ArchiveWriter:
         scans: file of the header and the scans, open to be read and appended to.
         index: file of the lines of the index, open to be read and appended to.
         header: facts that all scans have in common, as JSON.
-        folder: folder of the two files, for messages.
-
-    Raises:
-        OutputError: the files hold scans of another header.
     """
 
     def __init__(self, scans: BinaryIO, index: BinaryIO, header: dict[str, Any], folder: Path) -> None:
@@ -132,9 +124,6 @@ class ArchiveWriter:
         """Keep the options of the command, unless the file was begun with others: scans may all have the same names.
 
         A command that stopped at a bad point or scan may go on without it.
-
-        Raises:
-            OutputError: the unfinished file was begun with other options.
         """
         begun = read_json(path) if path.exists() else chosen
         changed = [name for name, of in chosen.items() if begun.get(name) not in (of, *_STRICTER.get(name, ()))]
@@ -147,9 +136,6 @@ class ArchiveWriter:
 
         Args:
             identities: identity of each of the scans that are to be written.
-
-        Raises:
-            OutputError: the unfinished file holds other scans.
         """
         self._scans.seek(len(self._start))
         self._index.seek(0)
@@ -213,9 +199,6 @@ class Archive:
 
     Attributes:
         index_crc32: checksum of the index, which tells two files of scans with the same names apart.
-
-    Raises:
-        ScanError: another kind of file, or one that was cut off or altered.
     """
 
     def __init__(self, path: Path) -> None:
@@ -245,11 +228,7 @@ class Archive:
         return len(self.names)
 
     def read(self, index: int) -> bytes:
-        """Return the bytes of one scan.
-
-        Raises:
-            ScanError: altered bytes.
-        """
+        """Return the bytes of one scan."""
         begins, ends = int(self._ends[index - 1]) if index else self._begins, int(self._ends[index])
         with open_file(self.path, _WANTED) as file:
             file.seek(begins)

@@ -18,11 +18,7 @@ RoundedT = TypeVar("RoundedT")
 
 
 def range_coding() -> Any:
-    """Return constriction's stream coders.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
+    """Return constriction's stream coders."""
     try:
         return importlib.import_module("constriction").stream
     except ImportError:
@@ -123,11 +119,7 @@ class Encoder(Coder):
         return self._encoder.get_compressed().astype("<u4").tobytes()
 
     def rounded(self, by: Callable[[Rounding], RoundedT]) -> RoundedT:
-        """Code the first attempt in which no number lies near a border.
-
-        Raises:
-            ScanError: there is none.
-        """
+        """Code the first attempt in which no number lies near a border."""
         for attempt in range(ATTEMPTS):
             try:
                 found = by(Rounding(attempt, checked=True))
@@ -154,11 +146,7 @@ class Encoder(Coder):
 
 
 class Decoder(Coder):
-    """Reads what an :class:`Encoder` wrote.
-
-    Raises:
-        ScanError: words that no encoder writes for these probabilities.
-    """
+    """Reads what an :class:`Encoder` wrote."""
 
     def __init__(self, words: bytes) -> None:
         super().__init__()

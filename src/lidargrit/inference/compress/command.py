@@ -8,12 +8,11 @@ from typing import Any
 import torch
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import CheckpointError, DataError, ScanError, UsageError
-from lidargrit.core.files import claim_folder
+from lidargrit.core.errors import CheckpointError, ScanError, UsageError, no_usable_scan
 from lidargrit.core.version import __version__
-from lidargrit.data.export import IMAGE, check_names, claimed_scans, writable_format, write_array
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, projection_variant
+from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format, write_array
 from lidargrit.generation.generator import load
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
 from lidargrit.inference.compress.archive import Archive, writing
@@ -51,12 +50,6 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         config: number of scans, and what to do with unusable points and scans.
-
-    Raises:
-        ConfigError: a model without a pixel decoder, a step that is not one, or no range coder.
-        DataError: no usable scan, or two of one name.
-        OutputError: an unfinished file of another command, or one that cannot be written.
-        ScanError: a scan that cannot be used.
     """
     codec = ScanCodec(load(model), step_mm)
     reader = ScanReader(codec.sensor, projection_variant(locate(model)), projection=config.projection)
@@ -85,7 +78,7 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
                         reporting.message(f"{out.suffix} keeps no {lost}")
                 progress.advance(1)
         if not writer.num_scans:
-            raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
+            raise no_usable_scan(source)
     return Compressed(writer.num_scans, writer.num_returns, out.stat().st_size)
 
 
@@ -97,15 +90,8 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     Args:
         path: file that :func:`compress_scans` wrote.
         out: an empty folder, or one that the same command began: files that are there are not written again.
-        model: run by which it was compressed.
         kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
         chosen: indices of the scans that are wanted; all if there is none.
-
-    Raises:
-        ScanError: a file that was cut off or altered, or that this machine cannot reproduce.
-        CheckpointError: another model than the file's.
-        UnknownNameError: a format that is none, or that cannot be written.
-        UsageError: an index that the file does not have.
     """
     form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     archive = Archive(path)
@@ -115,24 +101,20 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
     codec = _codec_of(archive, model)
-    files = {index: archive.names[index] + suffix for index in chosen or range(len(archive))}
-    scans = {file: archive.names[index] for index, file in files.items()}
-    missing = [index for index, file in files.items() if not (out / file).exists()]
+    indices = list(dict.fromkeys(chosen)) or range(len(archive))
+    names = [archive.names[index] for index in indices]
     facts = {"source": path.name, "index_crc32": archive.index_crc32}
     facts |= {"step_mm": codec.steps.step_mm, "format": kind}
-    with (
-        claim_folder(out),
-        claimed_scans(out / "decompressed.json", {**facts, "scans": scans}),
-        reporting.progress("decompressing", len(files), len(files) - len(missing)) as progress,
-    ):
-        for index in missing:
-            image = codec.decompress(archive.read(index))
+    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], names)
+    with folder.writing("decompressing") as progress:
+        for number in folder.missing:
+            image, file = codec.decompress(archive.read(indices[number])), out / folder.files[number]
             if form is None:
-                write_array(out / files[index], image.range_m)
+                write_array(file, image.range_m)
             else:
-                form.write(out / files[index], unproject(image))
+                form.write(file, unproject(image))
             progress.advance(1)
-    return len(files)
+    return folder.num_written
 
 
 def _not_kept(image: RangeImage) -> str:

@@ -53,9 +53,6 @@ class Rounding:
             values: numbers of one kind.
             grid: grid of their kind.
             matters: True where the number has an effect; everywhere if not given.
-
-        Raises:
-            TooNearABorderError: a number that matters lies near a border, and roundings are checked.
         """
         sign = 1 if self.attempt % 2 else -1
         shift = 0.5 + sign * ((self.attempt + 1) // 2) / 16

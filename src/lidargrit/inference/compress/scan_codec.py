@@ -49,11 +49,7 @@ class ScanCodec:
     two phase by phase. Tokens are coded as equally likely: a transformer would make the file one hundredth smaller, and
     would take most of the time. Scans are computed on the CPU, one by one, whatever device the generator is on.
 
-    Args:
-        generator: generator with a pixel decoder.
 
-    Raises:
-        ConfigError: a generator without a pixel decoder, a step that is not one, or no range coder.
     """
 
     def __init__(self, generator: Generator, step_mm: int) -> None:
@@ -83,11 +79,7 @@ class ScanCodec:
 
     @torch.no_grad()
     def compress(self, image: RangeImage) -> bytes:
-        """Return a range image (H, W) as bytes; ranges are rounded to the step, which moves them by half of it at most.
-
-        Raises:
-            ConfigError: an image of another sensor.
-        """
+        """Return a range image (H, W) as bytes; rounding to the step moves ranges by half of it at most."""
         if image.range_m.ndim != 2 or not image.sensor.same_rays(self.sensor):
             raise ConfigError(
                 f"a range image {tuple(image.range_m.shape)} of the sensor {image.sensor.name!r}",
@@ -108,11 +100,7 @@ class ScanCodec:
 
     @torch.no_grad()
     def decompress(self, compressed: bytes) -> RangeImage:
-        """Return the range image (H, W) that :meth:`compress` was given, its ranges rounded to the step.
-
-        Raises:
-            ScanError: bytes of another model or machine; their pixels have another hash.
-        """
+        """Return the range image (H, W) that :meth:`compress` was given, its ranges rounded to the step."""
         if len(compressed) < _HASH_BYTES or (len(compressed) - _HASH_BYTES) % 4:
             raise not_reproduced()
         pixels = self._code(Decoder(compressed[_HASH_BYTES:]), None)

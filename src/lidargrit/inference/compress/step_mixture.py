@@ -18,7 +18,6 @@ class StepMixture:
     Args:
         mixture: mixtures of n ranges in 64 bits, as a network gives them.
         rounding: rounding of their numbers.
-        steps: steps of the ranges.
     """
 
     def __init__(self, mixture: RangeMixture, rounding: Rounding, steps: RangeSteps) -> None:

@@ -22,10 +22,6 @@ def open_segmenter(word: str, device: str = "") -> Segmenter:
     Args:
         word: folder of a run or of a bundle, or ``pretrained``.
         device: device to compute on; a GPU if there is one and none is named.
-
-    Raises:
-        ConfigError: no such folder, or a run that does not label scans.
-        CheckpointError: a damaged run, or one that is not finished.
     """
     folder, wanted = locate(word, "segment"), "a segmenter's run, or pretrained"
     if not folder.exists():
@@ -38,12 +34,7 @@ def open_segmenter(word: str, device: str = "") -> Segmenter:
 
 
 def can_label(own: SensorModel, sensor: SensorModel) -> bool:
-    """Return whether a segmenter of one sensor can label images of another: of its rows, and n times its columns.
-
-    Args:
-        own: sensor of the segmenter.
-        sensor: sensor of the images.
-    """
+    """Return whether a segmenter of one sensor can label images of another: of its rows, and n times its columns."""
     if own.height != sensor.height or sensor.width % own.width:
         return False
     rows = [each.elevation_rad.double().mean(1) for each in (own, sensor)]

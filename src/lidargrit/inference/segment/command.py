@@ -1,6 +1,5 @@
 """The verb segment: a source of scans, a segmenter and a folder → the scans with a label for every point."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +7,10 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ConfigError, DataError, ScanError
-from lidargrit.core.files import claim_folder
-from lidargrit.data.export import KittiTree, claimed_scans, write_with_labels
+from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, weights_sha256
+from lidargrit.data.scan_folder import KittiTree, ScanFolder, write_with_labels
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
 from lidargrit.inference.complete.inputs import ScanReader
@@ -48,46 +46,35 @@ def segment_scans(
         out: an empty folder, or one that the same command began.
         model: segmenter; see :func:`.open_segmenter`.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-        device: device to compute on.
         numbering: numbering of the scans' own labels, with which the found ones are compared; "" for no comparison.
 
     Returns:
         number of scans that are there now, and how well their own labels were found, None without a comparison.
-
-    Raises:
-        ConfigError: a run that does not label scans, range images of other rows, or own labels of another numbering.
-        ScanError: a scan that cannot be used, or of another sensor.
-        DataError: no usable scan, or own labels are missing where they are to be compared.
-        OutputError: the folder holds something else, lies in the source, or cannot be written.
     """
     config = config or DataConfig()
     segmenter = open_segmenter(model, device)
     source_scans = _opened(source, segmenter, config)
     source_scans.check_output(out)
-    scans = _LabelledScans(source_scans, segmenter, config.projection)
+    labels = _Labels(source_scans, segmenter, config.projection)
     files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
-    identities = {file: source_scans.identity(index) for index, file in enumerate(files)}
-    facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment")), "scans": identities}
-    missing = [index for index, file in enumerate(files) if not (out / file).exists()]
+    identities = [source_scans.identity(index) for index in range(len(files))]
+    facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment"))}
+    folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     scores = LabelScores() if numbering else None
-    wanted, left_out = missing if scores is None else range(len(files)), set[int]()
+    wanted = folder.missing if scores is None else range(len(files))
     if scores is not None:
-        _own_labels(scans.scan(0), numbering)  # a mistake is told before anything is written
-    with (
-        claim_folder(out),
-        claimed_scans(out / MANIFEST, facts) as files_left_out,
-        reporting.progress("labelling", len(files), len(files) - len(wanted)) as progress,
-    ):
-        for index, scan, label in scans.labelled(wanted, left_out if config.bad_scans == "skip" else None):
+        _own_labels(source_scans.scan(0), numbering)  # a mistake is told before anything is written
+    with folder.writing("labelling", len(wanted)) as progress:
+        for index in wanted:
+            with folder.leaving_out(index):
+                scan = source_scans.scan(index)
+                label = labels.of(index, scan)
+                if index in folder.missing:
+                    write_with_labels(out / files[index], replace(scan, label=label))
+                if scores is not None:
+                    scores.add(label, _own_labels(scan, numbering))
             progress.advance(1)
-            if index in missing:
-                write_with_labels(out / files[index], replace(scan, label=label))
-            if scores is not None:
-                scores.add(label, _own_labels(scan, numbering))
-        files_left_out.update(files[index] for index in left_out)
-    if len(left_out) == len(files):
-        raise DataError(f"no usable scan in {source}", "at least one", "see the messages above")
-    return len(files) - len(left_out), scores
+    return folder.num_written, scores
 
 
 def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans:
@@ -103,8 +90,8 @@ def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans
     return scans
 
 
-class _LabelledScans:
-    """The scans of a source, and the label that a segmenter finds for every point of them.
+class _Labels:
+    """The label that a segmenter finds for every point of a scan.
 
     Args:
         scans: scans of the source.
@@ -119,32 +106,8 @@ class _LabelledScans:
             set[str](),
         )
 
-    def scan(self, index: int) -> Scan:
-        """Return the points of a scan with the labels that it came with; of an image, a point for each return."""
-        return self._scans.scan(index)
-
-    def labelled(
-        self, indices: Iterable[int], skipped: set[int] | None
-    ) -> Iterator[tuple[int, Scan, Int[Tensor, " n"]]]:
-        """Yield each index with its scan and a label for every point.
-
-        Args:
-            indices: indices of scans.
-            skipped: set that gets the indices of unusable scans; None to refuse these.
-        """
-        for index in indices:
-            try:
-                scan = self.scan(index)
-                label = self._label(index, scan)
-            except ScanError as error:
-                if skipped is None:
-                    raise
-                reporting.message(f"left out: {error}")
-                skipped.add(index)
-            else:
-                yield index, scan, label
-
-    def _label(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
+    def of(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
+        """Return the labels of a scan of the source."""
         if isinstance(self._scans, ImageScans):
             image = label_images(self._segmenter, RangeImage.stack([self._scans.image(index)]))
             assert image.label is not None

@@ -138,13 +138,8 @@ def fit_sensor_to_dataset(
 
     Args:
         dataset: scans, see :func:`lidargrit.data.datasets.open_dataset`.
-        name: name of the new sensor.
         num_scans: largest number of scans to use; 0 for all.
         bad_scans: ``refuse`` to go on when a scan cannot be used, or ``skip`` it with a warning.
-
-    Raises:
-        ConfigError: a negative number of scans, or a name that is blank, too long or cannot be printed in one line.
-        ScanError: a scan that cannot be used, or does not show its sensor.
     """
     if num_scans < 0:
         raise ConfigError(f"-n {num_scans}", "at least 1 scan, or 0 for all", "raise it")

@@ -92,7 +92,6 @@ def offsets_deg(
     file divided by the number of lasers.
 
     Args:
-        scans: points of each scan.
         rings: ring of each point, counted from 0; -1 for none.
         count: number of rings.
         lasers: number of entries of a firing in the files; some may never have returned.

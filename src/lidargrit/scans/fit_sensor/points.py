@@ -39,11 +39,7 @@ class Points:
 
     @classmethod
     def of_scan(cls, scan: Scan) -> "Points":
-        """Return the points of a scan, or refuse one that cannot show its sensor.
-
-        Raises:
-            ScanError: too few points, or not a full revolution.
-        """
+        """Return the points of a scan, or refuse one that cannot show its sensor."""
         if far := far_away(scan):
             raise far
         x, y, z = scan.points_xyz_m.double().numpy().T

@@ -83,9 +83,6 @@ def project_by_what_fits(
 
     Returns:
         the image, and the method and variant by which it was made.
-
-    Raises:
-        ScanError: the scan fits neither, or is a file that was cut off: too few points without a ring, in firing order.
     """
     method = projection_that_fits(scan, sensor)
     try:

@@ -65,11 +65,7 @@ class PixelCoordinates:
 def pixel_coordinates(
     scan: Scan, sensor: SensorModel, method: ProjectionName, variant: ProjectionVariant
 ) -> PixelCoordinates:
-    """Find the row, the fine column and the range of every point.
-
-    Raises:
-        ConfigError: no method or variant of that name.
-    """
+    """Find the row, the fine column and the range of every point."""
     for name, value, hint in (("method", method, ProjectionName), ("variant", variant, ProjectionVariant)):
         if value not in get_args(hint):
             raise ConfigError(f"{name}={value!r}", one_of(get_args(hint)), "correct it")

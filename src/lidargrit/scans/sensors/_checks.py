@@ -38,11 +38,7 @@ def check_tables(
     column_stride: int,
     first_edge_rad: float = math.pi,
 ) -> None:
-    """Check the shapes, the sizes and the angles of a sensor's tables, in radians.
-
-    Raises:
-        ConfigError: shapes that do not match, angles out of bounds, rows that do not fall.
-    """
+    """Check the shapes, the sizes and the angles of a sensor's tables, in radians."""
     if not (
         elevation.ndim == azimuth.ndim == 2
         and len(azimuth) in (1, len(elevation))
@@ -124,11 +120,7 @@ def _check_angles(name: str, table: str, angles_rad: Tensor, at_most_rad: float)
 
 
 def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
-    """Return the entries of a sensor's JSON, its tables as tensors and its metres as floats.
-
-    Raises:
-        ConfigError: no named entries, one missing, unknown, of another type or out of its bounds.
-    """
+    """Return the entries of a sensor's JSON, its tables as tensors and its metres as floats."""
     if not isinstance(data, dict):
         raise ConfigError(f"a {type(data).__name__} instead of a sensor", "named entries, {...}", _CURE)
     known = {*_WORDS, *_NUMBERS, *_TABLES}

@@ -31,7 +31,6 @@ class Scene:
         theme: kind of street: city, suburb or country.
         plan: layout of the roads and the ground.
         standing: triangles that never move.
-        moving: objects that move.
         attitude_rad: yaw, pitch and roll of our car relative to the road.
     """
 
@@ -77,9 +76,6 @@ def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
 
     Args:
         theme: dense city, suburb with gardens, open country, or mixed: chosen at random, mostly suburb and city.
-
-    Raises:
-        ConfigError: a theme of another name.
     """
     if theme not in get_args(Theme):
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of these")

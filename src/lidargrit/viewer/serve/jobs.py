@@ -48,9 +48,6 @@ class JobQueue:
         runs: folders of finished runs.
         folder: an empty folder for uploads and results; the caller removes it.
         limits: bounds on what may be asked for.
-
-    Raises:
-        LidarGritError: a run that cannot be read.
     """
 
     def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits | None = None) -> None:
@@ -222,12 +219,7 @@ class WorkerProcess:
         self._process.stdin.flush()
 
     def receive(self, seconds: float) -> dict[str, Any]:
-        """Return the next message.
-
-        Raises:
-            TimeoutError: no message came in time.
-            EOFError: the process has ended, perhaps in the middle of a message.
-        """
+        """Return the next message."""
         try:
             line = self._lines.get(timeout=seconds)
         except queue.Empty:

@@ -87,11 +87,7 @@ def sampling_settings(sampling: Any) -> list[SamplingSetting]:
 
 
 def parse_json_object(data: bytes) -> dict[str, Any]:
-    """Parse the JSON object of a request.
-
-    Raises:
-        ConfigError: the bytes are not a JSON object.
-    """
+    """Parse the JSON object of a request."""
     try:
         return parse_json(data, "a request")
     except CheckpointError:
@@ -107,9 +103,6 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
         values: values by name; a missing one has its default.
         settings: sampling settings of each model that is served.
         limits: bounds on what may be asked for.
-
-    Raises:
-        ConfigError: an unknown name, a value of another type, or one out of its bounds.
     """
     known = ("model", "seed", "count", "sampling", "task", "region", "name")
     for name in values:

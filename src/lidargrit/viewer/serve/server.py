@@ -56,10 +56,6 @@ def serve(
         host: address to listen at; a loopback one keeps the page to this machine.
         port: port to listen at; 0 for any that is free.
         limits: bounds on what clients may ask for.
-
-    Raises:
-        OutputError: the address is taken, or not this machine's.
-        LidarGritError: a run that cannot be read.
     """
     with open_server(runs, host, port, device, limits) as server:
         name = socket.gethostname() if host in ALL_ADDRESSES else host

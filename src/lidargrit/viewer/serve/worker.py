@@ -124,12 +124,8 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     """Sample new scans, or complete, upsample, drop or reconstruct an uploaded scan.
 
     Args:
-        generator: model that does it.
         request: task and settings that the page sent.
         variant: variant of the projection that the model learned from.
-
-    Raises:
-        LidarGritError: a file that cannot be used, or a setting out of its bounds.
     """
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
     own = generator.completion_sampling() if request.file else generator.Sampling()

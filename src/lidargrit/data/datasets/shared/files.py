@@ -251,9 +251,6 @@ def scans_below(root: Path) -> Iterator[Path]:
 
     Links to folders are followed after all folders that are none, so that these keep their names; once each, and not
     those that lead to a folder that has been searched or contains one.
-
-    Raises:
-        DataError: a folder below that cannot be read, whose scans would be missing.
     """
     if root.is_file():
         yield from [root] if formats.candidates(root) else []

@@ -23,9 +23,6 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     Args:
         sequence: folder that holds the files; a time or pose without its files is unknown.
 
-    Raises:
-        DataError: a file that is no table of finite numbers, times that do not rise, or poses without ``Tr``.
-
     Source:
         Geiger et al., CVPR 2012, readme.txt of the odometry benchmark's development kit.
     """
@@ -61,11 +58,7 @@ def _homogeneous(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 
 
 
 def table(path: Path, columns: int, wanted: str) -> Float64[np.ndarray, "n columns"]:
-    """Return the rows of a file of numbers between blanks, without comments; none where there is no such file.
-
-    Raises:
-        DataError: another number of columns, or something else than finite numbers.
-    """
+    """Return the rows of a file of numbers between blanks, without comments; none where there is no such file."""
     rows = [line for line in _lines(path) if line.strip() and not line.lstrip().startswith("#")]
     return _numbers(rows, columns, path, wanted)
 

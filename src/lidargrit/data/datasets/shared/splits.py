@@ -32,9 +32,6 @@ class Split:
         Args:
             text: split as the user typed it.
             known: names of the sequences that there are; they may hold a plus sign and brackets themselves.
-
-        Raises:
-            DataError: brackets that hold no share.
         """
         match = None if text in known else _SHARE.search(text)
         selection = text[: match.start()] if match else text

@@ -24,11 +24,6 @@ class Streets(ScanDataset):
     Attributes:
         seeds: seeds of the streets.
         made_by: sensor that scans them.
-
-    Raises:
-        DataError: no count, or an unknown split.
-        UnknownNameError: no sensor of that name.
-        ConfigError: a file that holds no sensor.
     """
 
     licence = "none needed: made by this program"

@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Num
 
 from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.data.formats import BadPoints, damaged
+from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes
 from lidargrit.scans.columns import parts_of_columns
 from lidargrit.scans.types import Scan
 
@@ -20,6 +20,27 @@ REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that h
 _NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
 _WITHIN_A_SCAN_S = 2.0
+
+
+class ColumnFormat(ScanFormat):
+    """A format of named columns, which keeps all that a scan has of intensity, ring, label, filled points and times."""
+
+    reflectance = REFLECTANCE_RULE
+    keeps = ("reflectance", "ring", "label")
+
+    @classmethod
+    def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
+        """Return coordinates, and what the scan has of intensity, ring, label, filled and time."""
+        return columns_of(scan)
+
+
+def begins_as(path: Path, num_bytes: int, check: Callable[[bytes, Path], object]) -> bool:
+    """Return whether the first bytes of a file are the header of a format, by what checks and refuses it."""
+    try:
+        check(first_bytes(path, num_bytes), path)
+    except ScanError:
+        return False
+    return True
 
 
 def scan_of_columns(
@@ -64,11 +85,7 @@ def plain_text(data: bytes) -> bytes:
 
 
 def check_lines(data: bytes, path: Path, wanted: str) -> None:
-    """Refuse text with a line longer than any of numbers: NumPy takes twenty times the memory of a line.
-
-    Raises:
-        ScanError: such a line.
-    """
+    """Refuse text with a line longer than any of numbers: NumPy takes twenty times the memory of a line."""
     start = 0
     while len(data) - start > _LINE_BYTES_AT_MOST:
         start = data.rfind(b"\n", start, start + _LINE_BYTES_AT_MOST) + 1
@@ -78,11 +95,7 @@ def check_lines(data: bytes, path: Path, wanted: str) -> None:
 
 
 def text_rows(data: bytes, rows: int, names: list[str], path: Path, wanted: str) -> dict[str, np.ndarray]:
-    """Read rows of numbers between blanks.
-
-    Raises:
-        ScanError: fewer rows, other columns, or no numbers.
-    """
+    """Read rows of numbers between blanks."""
     promised = f"the {rows} rows of {len(names)} numbers that its header says"
     if 2 * rows * len(names) > len(data) + 1:  # a number takes a digit and a blank; room is made for all rows at once
         raise ScanError(f"{len(data)} bytes of text in {path}", promised, "download it again: the file was cut short")

@@ -20,11 +20,7 @@ def marks_file(path: Path) -> Path:
 
 
 def read_marks(path: Path, count: int) -> Bool[Tensor, "n"] | None:
-    """Return which points of a file a model added; None where no marks lie beside it.
-
-    Raises:
-        ScanError: marks of another number of points, or other bytes than 0 and 1.
-    """
+    """Return which points of a file a model added; None where no marks lie beside it."""
     beside = marks_file(path)
     if not beside.is_file():
         return None

@@ -63,11 +63,7 @@ class Contents(NamedTuple):
 
 
 def contents_by_index(file: BinaryIO) -> Contents | None:
-    """Read what the summary at a file's end says; None if there is none, or if it leaves anything out.
-
-    Raises:
-        ValueError: a summary or a chunk that no recorder writes.
-    """
+    """Read what the summary at a file's end says; None if there is none, or if it leaves anything out."""
     try:
         summary = _summary(file)
     except _ImplausibleError:
@@ -103,9 +99,6 @@ def contents_by_records(file: BinaryIO, types: tuple[str, ...]) -> Contents:
     Args:
         file: recording that is open for reading.
         types: types whose messages are wanted; others that lie outside of chunks are not listed.
-
-    Raises:
-        ValueError: a chunk that no recorder writes, or whose checksum is wrong.
     """
     from mcap.data_stream import ReadDataStream  # noqa: PLC0415  an optional part
     from mcap.opcode import Opcode  # noqa: PLC0415

@@ -39,9 +39,6 @@ def check_packets(path: Path, wanted: str, cure: str) -> None:
 
     Only headers are looked at, once, a few microseconds for each record. A last record that was cut short is fine.
 
-    Raises:
-        ScanError: a record of an impossible length, a UDP packet without content, or an unreadable file.
-
     Source:
         Files: libpcap, pcap-savefile(5); IETF draft-ietf-opsawg-pcapng, sections 4.1 to 4.4.
         IP: RFC 791, section 3.1; RFC 8200, section 3.

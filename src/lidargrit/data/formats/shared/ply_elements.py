@@ -53,9 +53,6 @@ def binary_rows(data: bytes, start: int, element: Element, order: str) -> tuple[
         start: position of its first row.
         element: element of the header.
         order: numpy's sign for the byte order.
-
-    Raises:
-        ValueError: fewer bytes than the rows need.
     """
     if not element.rows:
         return {}, start
@@ -84,11 +81,7 @@ def binary_rows(data: bytes, start: int, element: Element, order: str) -> tuple[
 
 
 def text_columns(data: bytes, element: Element) -> dict[str, np.ndarray]:
-    """Return the columns of an element with lists, of text in which each row is a line.
-
-    Raises:
-        ValueError: fewer lines or words, or words that are no numbers.
-    """
+    """Return the columns of an element with lists, of text in which each row is a line."""
     places = element.single()
     if 2 * element.rows * len(element.properties) > len(data) + 1:  # a number takes a digit and a blank
         raise ValueError(f"{len(data)} bytes of text, less than its rows need")

@@ -17,9 +17,6 @@ def columns_of_cloud(cloud: Any) -> tuple[dict[str, np.ndarray], tuple[str, ...]
     A field of several numbers a point is left alone, and so is one that lies beyond the point; of two of one name the
     first counts. ``row_step`` tells where rows begin, if there are several; where they cannot begin there, points
     follow one another without gaps.
-
-    Raises:
-        ValueError: fewer bytes than points.
     """
     notes, fields = [], {}
     size = int(cloud.point_step)

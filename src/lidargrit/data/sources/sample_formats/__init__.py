@@ -33,7 +33,6 @@ class SampleFormat:
 
     Args:
         title: name of the program that writes such samples.
-        source: origin of the facts.
         channels: number of channels of its tensors, which are (channels, rows, columns) or (scans, channels, rows,
             columns).
         sensors: possible sensors, each as a name, the number of fine columns (0 for the sensor's own), and the step
@@ -77,11 +76,7 @@ def is_tensor_folder(folder: Path) -> bool:
 
 
 def recognise(folder: Path) -> str:
-    """Name the program that wrote a folder of tensors, by the number of channels of the first.
-
-    Raises:
-        ScanError: a tensor of none of them.
-    """
+    """Name the program that wrote a folder of tensors, by the number of channels of the first."""
     path = _paths(folder)[0]
     shape = tuple(read_tensor(path).shape)
     known = {load_sample_format(name).channels: name for name in discovery.names("sample-formats")}
@@ -98,10 +93,6 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
         folder: folder of ``.pth`` files, with one scan or one batch of scans each.
         name: name of the sample format; recognised from the number of channels if empty.
         count: largest number of scans, evenly spaced; all if not given.
-
-    Raises:
-        DataError: no tensor in the folder.
-        ScanError: a file that is damaged, too large, more than a tensor, or not of this sample_format.
     """
     form = load_sample_format(name or recognise(folder))
     store = _Tensors(_paths(folder), form, count)
@@ -109,22 +100,13 @@ def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -
 
 
 def sensor_of_tensors(folder: Path, name: str = "") -> SensorModel:
-    """Return the sensor that the first file of a folder of tensors fits.
-
-    Raises:
-        DataError: no tensor in the folder.
-        ScanError: a file that is damaged, too large, more than a tensor, or not of this sample format.
-    """
+    """Return the sensor that the first file of a folder of tensors fits."""
     path = _paths(folder)[0]
     return _sensor_of(read_tensor(path), path, load_sample_format(name or recognise(folder)))
 
 
 def read_tensor(path: Path) -> Tensor:
-    """Read the one tensor that a file holds; nothing else in it is looked at, and no code in it is run.
-
-    Raises:
-        ScanError: no tensor, or larger than scans are.
-    """
+    """Read the one tensor that a file holds; nothing else in it is looked at, and no code in it is run."""
     wanted, cure = f"one tensor of at most {_BYTES_AT_MOST >> 20} MB", "save it as one: torch.save(tensor, path)"
     try:
         if not path.is_file():  # a pipe would hang

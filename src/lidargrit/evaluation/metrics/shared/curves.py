@@ -48,9 +48,6 @@ class CurveMetric(ImageMetric):
     little was seen.
     Only counts are kept, so that memory does not grow with the sets and no order of images matters.
 
-    Raises:
-        ConfigError: images of two sizes or two pairs of range limits.
-
     Source:
         Lin, Divergence measures based on the Shannon entropy, IEEE Trans. Information Theory 37(1), 1991, eq. 4.1;
         its square root is a metric: Endres and Schindelin, IEEE Trans. Information Theory 49(7), 2003.

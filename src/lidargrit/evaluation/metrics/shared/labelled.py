@@ -26,7 +26,6 @@ class Labelled(FeatureExtractor[RangeImage]):
 
     Args:
         run: folder of the segmenter's run; None for the images' own labels.
-        device: device on which the segmenter computes.
     """
 
     run: Path | None
@@ -50,11 +49,6 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
         seed: seed of nothing: the metric has no random numbers.
         weights: folder of a segmenter's run; if not given, the segmenter in the package that has the images' rows.
         device: device on which the segmenter computes, such as "cuda".
-
-    Raises:
-        WeightsError: no segmenter for the rows of the images.
-        ConfigError: images of two sizes or two pairs of range limits, or merged parts by other segmenters.
-        DataError: images without labels, for the variant ``labelled``.
     """
 
     bounds = (0.0, 1.0)
@@ -106,11 +100,7 @@ def segmenter_of(sensor: SensorModel, named: Path | None = None) -> Path:
     """Return the folder of the segmenter for images of a sensor.
 
     Args:
-        sensor: sensor of the images.
         named: folder of a run, or of a bundle; None for the package's own.
-
-    Raises:
-        WeightsError: the run is no segmenter, or none has these rows.
     """
     folders = [locate(each, "segment") for each in (PACKAGED if named is None else [named])]
     configs = {folder: read_config(folder) for folder in folders}

@@ -82,12 +82,7 @@ class NormalisedImages:
         return cls(_LIDARGEN_WINDOW_M if variant == "r2dm" else None)
 
     def __call__(self, images: RangeImage) -> Float[Tensor, "B 5 H W"]:
-        """Return the channels of a batch.
-
-        Raises:
-            DataError: images without reflectance.
-            ConfigError: a number of columns that cannot be halved five times.
-        """
+        """Return the channels of a batch."""
         if images.reflectance is None:
             raise DataError(
                 "range images without reflectance",
@@ -129,10 +124,6 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
 
     Args:
         variant: the published definition to compute; the first of ``variants`` if not given.
-
-    Raises:
-        WeightsError: no weights, or not those of the network.
-        ConfigError: images of two sizes or two pairs of range limits, or merged parts that used other weights.
     """
 
     def __init__(

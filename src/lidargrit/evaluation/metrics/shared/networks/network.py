@@ -32,11 +32,6 @@ class PretrainedNetwork:
 
     Args:
         name: name of the network, one of ``NETWORKS``.
-        path: file with its weights.
-
-    Raises:
-        WeightsError: the file is not to be had, or not of this network.
-        ConfigError: a device that is not there.
     """
 
     def __init__(self, name: str, path: Path, device: str) -> None:
@@ -49,11 +44,7 @@ class PretrainedNetwork:
         return load_network, (self.name, self.path, str(self._device))
 
     def features(self, images: Float[Tensor, "B ..."]) -> Float32[np.ndarray, "B d"]:
-        """Return the features of a batch, on the CPU.
-
-        Raises:
-            WeightsError: features that are no finite numbers: the weights are none that came from training.
-        """
+        """Return the features of a batch, on the CPU."""
         step = 1 if self._device.type == "cpu" else _BATCH
         parts = [self._forward(part) for part in images.float().split(step)]
         return np.concatenate(parts)
@@ -77,9 +68,6 @@ def load_network(name: str, weights: Path | None = None, device: str = "cpu") ->
 
     Args:
         name: name of the network, one of ``NETWORKS``.
-
-    Raises:
-        WeightsError: the file is not to be had, or not of this network.
     """
     path = find_weights(NETWORKS[name][0], weights)
     status = path.stat() if path.is_file() else None
@@ -92,11 +80,7 @@ def _loaded(name: str, path: Path, device: str, _file: tuple[int, int] | None) -
 
 
 def filled(build: Callable[[], nn.Module], weights: dict[str, Tensor], source: Path) -> nn.Module:
-    """Make a network and give it weights of the very same layout.
-
-    Raises:
-        WeightsError: a name or a size differs; names the first.
-    """
+    """Make a network and give it weights of the very same layout."""
     with torch.device("meta"):  # takes no memory and no random numbers for what is replaced anyway
         module = build()
     wanted = {name: tensor.shape for name, tensor in module.state_dict().items()}

@@ -64,9 +64,6 @@ def find_weights(published: PublishedWeights, given: Path | None = None) -> Path
     """Return the file with the weights: the given one, else one that is there already, else download it to the cache.
 
     It is looked for in ``$LIDARGRIT_WEIGHTS`` and in ``weights`` in the cache, by the name that it has at its source.
-
-    Raises:
-        WeightsError: it lies nowhere and cannot be fetched; says from where to get it, and on which terms.
     """
     if given is not None:
         return given
@@ -85,9 +82,6 @@ def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Ten
     Returns:
         the tensors, float32, in memory of their own, without the counters that networks in training keep; and the
         SHA-256 of the file.
-
-    Raises:
-        WeightsError: no file, too large a one, another checksum than is known, or anything in it but float32 tensors.
     """
     if not path.is_file():  # a pipe would hang
         raise _unfit(published, f"{path}, which is no file")

@@ -1,0 +1,230 @@
+"""Scans that a command writes → a folder with a file for each, and a manifest by which the same command goes on."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from lidargrit.core import discovery, reporting
+from lidargrit.core.errors import DataError, OutputError, ScanError, UnknownNameError, no_usable_scan, one_of
+from lidargrit.core.files import (
+    atomic_path,
+    claim_folder,
+    claimed_manifest,
+    is_partial,
+    is_taken,
+    read_json,
+    write_json,
+)
+from lidargrit.core.reporting import Progress
+from lidargrit.core.untrusted import user_path
+from lidargrit.data import formats
+from lidargrit.data.formats import ScanFormat
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.scans.types import Scan
+
+TREE = "kitti_odometry"  # the data set that reads such a tree back
+IMAGE = "image"  # the word for range images as .npy, in place of a format
+_KITTI_NAME = re.compile(r"\d{2,}/\d{6}")  # sequence and number
+
+
+class ScanFolder:
+    """A folder of scans that a command writes; files that are there already are not written again.
+
+    Args:
+        out: an empty folder, or one that the same command began; more scans can be added to it.
+        manifest: name of the file that says how the scans were made, and which file holds which.
+        facts: entries of the manifest, among them the ``source``; a folder with other entries is refused.
+        files: file of each scan, below the folder.
+        identities: identity of the scan in each file, such as its name in the source.
+        bad_scans: treatment of a scan that cannot be used.
+
+    Attributes:
+        missing: indices of the files that are still to be written.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        manifest: str,
+        facts: dict[str, Any],
+        files: Sequence[str],
+        identities: Sequence[str],
+        bad_scans: Literal["refuse", "skip"] = "refuse",
+    ) -> None:
+        check_names(facts["source"], files)
+        if link := next((out / file for file in files if (out / file).is_symlink()), None):
+            # What it leads to is not of this command, and would count as written.
+            raise OutputError(f"{link}, which is a link", "a file of this command, or none", "remove the link")
+        self.out, self.files, self._manifest = out, files, out / manifest
+        self._facts = {**facts, "scans": dict(zip(files, identities, strict=True))}
+        self._bad_scans, self._left_out, self._told_labels = bad_scans, set[str](), False
+        self.missing = [index for index, file in enumerate(files) if not (out / file).exists()]
+
+    @property
+    def num_written(self) -> int:
+        """Number of scans that are there once all is done."""
+        return len(self.files) - len(self._left_out)
+
+    @contextmanager
+    def writing(self, what: str, remaining: int | None = None) -> Iterator[Progress]:
+        """Hold the folder while its files are written, and yield the progress to be advanced by each.
+
+        At the end, the manifest lists the files that were left out no more. If no scan was written, a new manifest is
+        removed again.
+
+        Args:
+            what: name of the work, for the bar.
+            remaining: number of scans that it is done with; those that are missing if not given.
+        """
+        total = len(self.files)
+        done = total - (len(self.missing) if remaining is None else remaining)
+        with (
+            claim_folder(self.out),
+            claimed_manifest(self._manifest),
+            reporting.progress(what, total, done) as progress,
+        ):
+            self._claim()
+            yield progress
+            if len(self._left_out) == total:
+                raise no_usable_scan(self._facts["source"])
+            if self._left_out:
+                there = read_json(self._manifest)
+                kept = {file: name for file, name in there["scans"].items() if file not in self._left_out}
+                write_json(self._manifest, {**there, "scans": kept})
+
+    @contextmanager
+    def leaving_out(self, *indices: int) -> Iterator[None]:
+        """Leave files out, with the reason, if their scan turns out to be unusable; or let the refusal through."""
+        try:
+            yield
+        except ScanError as error:
+            if self._bad_scans == "refuse":
+                raise
+            reporting.message(f"left out: {error}")
+            self._left_out.update(self.files[index] for index in indices)
+
+    def tell_labels_lost(self, file: str) -> None:
+        """Tell, the first time, that a file by its ending keeps no labels."""
+        if not self._told_labels:
+            reporting.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
+            self._told_labels = True
+
+    def _claim(self) -> None:
+        """Write the manifest, or add to the one that is there."""
+        scans = self._facts["scans"]
+        for file in scans:
+            parts = PurePosixPath(file).parts
+            if PurePosixPath(file).is_absolute() or ".." in parts or any(map(is_partial, parts)):
+                raise OutputError(f"a scan that would lie outside, in {file}", "names below a folder", "rename it")
+            user_path(str((self.out / file).absolute()), OutputError)  # refuses names that no file can have
+        there = begun_by(self._manifest, self._difference)
+        if there is None:
+            write_json(self._manifest, self._facts)
+        elif not scans.keys() <= there["scans"].keys():
+            write_json(self._manifest, {**self._facts, "scans": {**there["scans"], **scans}})
+
+    def _difference(self, there: dict[str, Any]) -> str:
+        known, facts, scans = there.get("scans"), self._facts, self._facts["scans"]
+        if not isinstance(known, dict):
+            return f"whose {self._manifest.name} lists no scans"
+        if other := [
+            name for name in sorted({*there, *self._facts} - {"scans"}) if there.get(name) != self._facts.get(name)
+        ]:
+            return f"whose {self._manifest.name} has another {other[0]!r}"
+        changed = next((file for file, name in scans.items() if known.get(file, name) != name), None)
+        return f"where {changed} is another scan of {facts['source']}" if changed else ""
+
+
+def begun_by(manifest: Path, difference: Callable[[dict[str, Any]], str]) -> dict[str, Any] | None:
+    """Return the manifest that the same command wrote into a folder before; None where the folder is free.
+
+    Args:
+        manifest: file in the folder.
+        difference: function of the manifest, in words how another command wrote it ("which holds ..."); "" if the same.
+    """
+    is_ours_or_taken = is_taken(manifest.parent)  # asked first: another process may begin it just now
+    if manifest.is_file():
+        there = read_json(manifest)
+        if not (how := difference(there)):
+            return there
+    elif is_ours_or_taken:
+        how = f"which is not empty and holds no {manifest.name}"
+    else:
+        return None
+    wanted = "an empty folder, or one that this very command began"
+    raise OutputError(f"{manifest.parent}, {how}", wanted, "choose another folder")
+
+
+def check_names(source: str, names: Sequence[str]) -> None:
+    """Raise DataError if several scans of a source would be one file: the last would replace others."""
+    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
+        got = f"several scans of {source} that would be {twice[0]}"
+        raise DataError(got, "a name for each scan, as each becomes a file", "rename some, or take their folders apart")
+
+
+def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
+    """Write one value for each pixel as ``.npy``."""
+    with atomic_path(path) as unfinished, unfinished.open("wb") as file:
+        np.save(file, pixels.cpu().numpy())
+
+
+class KittiTree:
+    """The tree of KITTI odometry, with labels as SemanticKITTI has them.
+
+    Args:
+        out: folder of the tree.
+    """
+
+    keeps_labels = True
+
+    def __init__(self, out: Path) -> None:
+        self._out = out
+
+    def files(self, names: list[str]) -> list[str]:
+        """Keep KITTI's own names; number other folders, and the scans in each, in their order."""
+        if not all(map(_KITTI_NAME.fullmatch, names)):
+            folders = [str(PurePosixPath(name).parent) for name in names]
+            sequences = {folder: f"{number:02d}" for number, folder in enumerate(dict.fromkeys(folders))}
+            seen: Counter[str] = Counter()
+            numbered = []
+            for folder in folders:
+                numbered.append(f"{sequences[folder]}/{seen[folder]:06d}")
+                seen[folder] += 1
+            names = numbered
+        return [f"sequences/{name[:-7]}/velodyne/{name[-6:]}.bin" for name in names]
+
+    def write(self, file: str, scan: Scan) -> None:
+        """Write a scan; see :func:`write_with_labels`."""
+        write_with_labels(self._out / file, scan)
+
+
+def write_with_labels(path: Path, scan: Scan) -> None:
+    """Write a scan into a file of KITTI odometry's tree, and its labels, if it has any, into that beside it."""
+    if scan.label is not None:  # before the points, whose file says that the scan is complete
+        with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:
+            temporary.write_bytes(scan.label.numpy().astype("<u4").tobytes())
+    KittiBin.write(path, scan)
+
+
+def writable_format(kind: str, *others: str) -> tuple[type[ScanFormat], str]:
+    """Return the format of a name or an ending, and the ending of its files.
+
+    Args:
+        others: words that the command takes besides, to be named in the message.
+    """
+    if kind in discovery.names("formats"):
+        form, suffix = formats.load(kind), formats.load(kind).suffixes[0]
+    else:
+        suffix = f".{kind.lower().removeprefix('.')}"
+        form = next((one for one in formats.candidates(Path(f"scan{suffix}")) if suffix in one.suffixes), None)
+    if form is None or not form.can_write():
+        known = [name for name in discovery.names("formats") if formats.load(name).can_write()]
+        raise UnknownNameError(f"the format {kind!r} to write", one_of([*others, *known]), "choose one")
+    return form, suffix
