@@ -363,7 +363,7 @@ for words in ([], *([word] for word in sys.argv[1:])):
         main([*words, "--help"])
 main([])
 main(["list"])
-sys.exit(" ".join(name for name in ("torch", "numpy", "matplotlib", "rich", "jsonargparse") if name in sys.modules))
+sys.exit(" ".join(name for name in ("torch", "numpy", "matplotlib", "rich") if name in sys.modules))
 """
     verbs = [name.replace("_", "-") for name in discovery.names("cli")]
     done = python(program, *verbs)

@@ -174,8 +174,8 @@ def test_short_numbers_change_the_odds_a_little(transformer):
 
 @pytest.mark.parametrize("wrong", ["steps=0", "temperature=-1", "order_temperature=-1", "order_temperature=nan"])
 def test_a_wrong_choice_is_told(wrong):
-    with pytest.raises(ConfigError, match=r"wanted 1 to 100,000 steps|wanted a finite number"):
-        override(MaskedSampling(), [wrong.replace("nan", ".nan")])
+    with pytest.raises(ConfigError, match=r"wanted a (whole )?number, at least"):
+        override(MaskedSampling(), [wrong])
 
 
 def test_a_tokenizer_is_taken_from_another_run(tmp_path):

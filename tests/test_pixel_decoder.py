@@ -290,7 +290,7 @@ def test_an_image_that_cells_do_not_divide_is_refused() -> None:
         PixelDecoder(PixelDecoderConfig(), tiny_sensor(12, 16), FEATURES)
     with pytest.raises(ConfigError, match="a power of 2"):
         PixelDecoderConfig(coarsest_cell=6)
-    with pytest.raises(ConfigError, match="row_halvings=1000000; wanted at most 8"):
+    with pytest.raises(ConfigError, match="row_halvings=1000000; wanted a whole number, at least 0, at most 8"):
         PixelDecoderConfig(row_halvings=1_000_000)
     with pytest.raises(ConfigError, match="cells of 32x8"):
         PixelDecoder(PixelDecoderConfig(8, row_halvings=2), tiny_sensor(16, 32), FEATURES)

@@ -114,18 +114,18 @@ def test_words_that_are_accepted():
         (["compare", "out", "lidargrit_small", "--flops", "nan"], "--flops nan"),
         (["train", "lidargrit_small", "out", "--set", "data.columns=1000000000", "--dry-run"], "1000000000 columns"),
         (["train", "lidargrit_small", "out", "--set", f"data.columns={-(2**63)}", "--dry-run"], "columns"),
-        (["train", "lidargrit_small", "out", "--set", f"seed={2**64}", "--dry-run"], "seed with a number of 65 bits"),
+        (["train", "lidargrit_small", "out", "--set", f"seed={2**64}", "--dry-run"], "seed=18446744073709551616"),
         (
             ["train", "lidargrit_small", "out", "--set", f"data.max_scans={10**20}", "--dry-run"],
-            "max_scans with a number of 67",
+            "max_scans=1000",
         ),
         (
             ["train", "lidargrit_small", "out", "--set", f"training.tokenizer.scans={10**20}", "--dry-run"],
-            "scans with a number",
+            "tokenizer.scans=1000",
         ),
         (
             ["train", "lidargrit_small", "out", "--set", "training.tokenizer.learning_rate=.inf", "--dry-run"],
-            "rate=inf",
+            "rate=.inf",
         ),
         (
             [
@@ -136,7 +136,7 @@ def test_words_that_are_accepted():
                 f"model.tokenizer.channel_multipliers={[1] * 900}",
                 "--dry-run",
             ],
-            "wanted 1 to 16 positive numbers",
+            "wanted at least 1, at most 16 values",
         ),
         (
             [
@@ -147,10 +147,10 @@ def test_words_that_are_accepted():
                 f"model.tokenizer.channel_multipliers={[1] * 100_000}",
                 "--dry-run",
             ],
-            "at most 1,000 values",
+            "wanted at least 1, at most 16 values",
         ),
-        (["sample", "pretrained", "out", "--set", "sampling.temperature=1e400"], "temperature=inf"),
-        (["sample", "pretrained", "out", "--set", f"sampling.top_k={10**20}"], "top_k with a number of 67 bits"),
+        (["sample", "pretrained", "out", "--set", "sampling.temperature=1e400"], "temperature=1e400"),
+        (["sample", "pretrained", "out", "--set", f"sampling.top_k={10**20}"], "top_k=1000"),
     ],
 )
 def test_commands_refuse_in_one_line(words, got, tmp_path, monkeypatch, capsys):

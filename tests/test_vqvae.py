@@ -244,7 +244,7 @@ def test_sizes_that_cannot_be_halved_are_refused():
 @pytest.mark.parametrize("name", ["raydrop_weight", "reflectance_weight"])
 @pytest.mark.parametrize("wrong", [-0.1, float("nan")])
 def test_negative_weights_of_the_loss_are_refused(name, wrong):
-    with pytest.raises(ConfigError, match=f"{name}={wrong}; wanted 0 or more"):
+    with pytest.raises(ConfigError, match=f"{name}={wrong}; wanted a number, at least 0"):
         VqvaeConfig(**{name: wrong})
 
 

@@ -23,18 +23,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Tell the time, then train."""
     from lidargrit.core import reporting
-    from lidargrit.training import check_folder, computing_time, plan_training, train, training_flops
+    from lidargrit.training import check_folder, computing_time, plan_training, train
     from lidargrit.training.fine_tuning import fine_tuning_preset
 
     reporting.message("looking at the scans")
     preset = fine_tuning_preset(options.scans, options.sensor, scan_words(options))
     check_folder(options.out, preset)
-    flops = training_flops(preset)
-    said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in flops)
+    plan = plan_training(preset)
+    said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in plan.flops)
     reporting.message(f"scans seen: {said}; stop it at any time, the same command goes on")
-    reporting.message(computing_time(sum(flops.values()), "fp32"))
+    reporting.message(computing_time(sum(plan.flops.values()), "fp32"))
     if options.dry_run:
-        print(plan_training(preset).as_text())
+        print(plan.as_text())
         return
     train(preset, options.out)
     print(f"done: lidargrit sample {options.out} samples -n 16, or --model {options.out} wherever a run is wanted")

@@ -39,7 +39,8 @@ def run(options: argparse.Namespace) -> None:
     preset = load_preset(options.preset, scan_words(options))
     if options.dry_run or options.measure:
         refuse_taken(options)
-        planned, measured = plan_training(preset), measure(preset) if options.measure else []
+        planned = plan_training(preset)
+        measured = measure(preset, planned.flops) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
         print_result(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
         open_data(preset)  # last: the plan of a preset is worth reading on a machine without its data too

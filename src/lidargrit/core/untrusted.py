@@ -134,11 +134,6 @@ def seeds_in_a_row(first: int, count: int) -> range:
     return range(first, first + count)
 
 
-def is_temperature(value: float) -> bool:
-    """Return whether a number is 0 or at least :data:`TEMPERATURE_AT_LEAST`."""
-    return value == 0 or value >= TEMPERATURE_AT_LEAST
-
-
 def positive_number(word: str) -> float:
     """Return a number from 0 on that is neither NaN nor infinite."""
     try:

@@ -4,12 +4,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lidargrit.core.configuration import hints_of, rebuilt
 from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_json
-from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score, format_value
+from lidargrit.evaluation.intervals import Score, format_value
 from lidargrit.evaluation.verdict import Verdict, notes_on_floors, verdict
-from lidargrit.scans.types import MetricResult
 
+_OF_OTHER_FORM = {"protocol", "samples", "reference", "scores"}  # in the file
 LEFT_OUT, NOT_APPLICABLE = "left out", "not applicable"
 
 
@@ -140,19 +141,13 @@ class Scorecard:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> "Scorecard":
         """Return what :meth:`to_json` made plain values of; other values raise one of Python's own errors."""
-        protocol = dict(data["protocol"])
+        hints, protocol = hints_of(cls), dict(data["protocol"])
         return cls(
             str(protocol.pop("name")),
             protocol,
-            _set_record(data["inputs"]["samples"]),
-            _set_record(data["inputs"]["reference"]),
-            tuple(_score(each) for each in data["scores"]),
-            tuple(LeftOut(**{name: str(of) for name, of in each.items()}) for each in data["left_out"]),
-            tuple(map(str, data["deviations"])),
-            tuple(map(str, data["warnings"])),
-            dict(data["settings"]),
-            dict(data["versions"]),
-            str(data.get("leak", "")),
+            scores=tuple(_score(each) for each in data["scores"]),
+            **{name: rebuilt(hints[name], data["inputs"][name], name) for name in ("samples", "reference")},
+            **{name: rebuilt(hints[name], data[name], name) for name in hints.keys() & data.keys() - _OF_OTHER_FORM},
         )
 
     def as_table(self) -> str:
@@ -191,44 +186,7 @@ def _row(score: Score, with_pixels: bool) -> tuple[str, ...]:
     )
 
 
-def _set_record(data: dict[str, Any]) -> EvalSetRecord:
-    names = ("source", "data_set", "split", "sensor", "projection", "sha256", "weights_sha256")
-    words = {name: str(data[name]) for name in names}
-    return EvalSetRecord(**words, scans=int(data["scans"]), scans_used=int(data["scans_used"]))
-
-
 def _score(data: dict[str, Any]) -> Score:
-    result = MetricResult(
-        str(data["metric"]),
-        float(data["value"]),
-        bool(data["higher_is_better"]),
-        int(data["num_generated"]),
-        int(data["num_reference"]),
-        str(data["variant"]),
-        dict(data["details"]),
-    )
-    interval, real, pixels = data["interval"], data["real_against_real"], data["pixel_statistics"]
-    return Score(
-        result,
-        None
-        if interval is None
-        else Interval(
-            float(interval["low"]),
-            float(interval["high"]),
-            float(interval["standard_error"]),
-            int(interval["halves"]),
-            _optional(interval.get("mean_of_halves")),
-            tuple(map(float, interval.get("values", ()))),
-        ),
-        None
-        if real is None
-        else RealAgainstReal(
-            float(real["value"]), int(real["num_scans"]), int(real["halvings"]), _optional(real.get("spread"))
-        ),
-        float(data["seconds"]),
-        _optional(pixels),
-    )
-
-
-def _optional(number: float | None) -> float | None:
-    return None if number is None else float(number)
+    beside = {name: data[name] for name in hints_of(Score) if name != "result"}
+    result = {name: value for name, value in data.items() if name not in beside}
+    return rebuilt(Score, {"result": result, **beside})

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 
 CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
     "tokens": "turn scans into tokens and back",
@@ -15,7 +15,7 @@ CAPABILITIES = {  # name → what a generator with it can do besides sampling, f
 
 
 @dataclass(frozen=True)
-class NoSampling(TypedSettings):
+class NoSampling(Settings):
     """Settings of a generator that leaves nothing to choose."""
 
 

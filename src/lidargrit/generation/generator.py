@@ -54,6 +54,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     training_precision: ClassVar[Precision] = "auto"
     """Precision in which stages are trained where no preset names one."""
 
+    trains: ClassVar[tuple[tuple[str, ...], ...]] = ()
+    """Stages of training in order, each with the names of the networks, here and in its objective, that it trains."""
+
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 
@@ -98,7 +101,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages of training, in their order; they may depend on ``config``."""
-        return ()
+        return tuple(stage for stage, *_ in self.trains)
 
     @property
     def full_rows(self) -> range | None:
@@ -127,7 +130,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Load the weights of a stage's trained objective."""
-        raise NotImplementedError(f"{self.public_name()} has no stage {stage!r}")
+        for name in next(names for one, *names in self.trains if one == stage):
+            self.get_submodule(name).load_state_dict(objective.get_submodule(name).state_dict())
 
     def after_training(self) -> None:
         """Fit what depends on all trained stages."""

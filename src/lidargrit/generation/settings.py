@@ -1,9 +1,11 @@
 """An experiment as settings: its data, its model, and the training of each of its stages."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative, Positive, ShareBelow1, Weight
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import Generator, load_class
 from lidargrit.nn.size import numbers_at_most
@@ -14,7 +16,7 @@ _BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(Settings):
     """How one stage of a generator is trained; every duration is a number of scans seen.
 
     Args:
@@ -50,44 +52,30 @@ class TrainingConfig:
         pictures_every: number of scans between two pictures of reconstructed or sampled scans; 0 for none.
     """
 
-    scans: int
-    batch_size: int
-    learning_rate: float
+    scans: Count
+    batch_size: Annotated[int, Bounds(1, _BATCH_AT_MOST)]
+    learning_rate: Positive
     schedule: Literal["constant", "cosine", "linear_second_half"] = "constant"
-    warmup_scans: int = 0
+    warmup_scans: NotNegative = 0
     optimiser: Literal["adamw", "muon"] = "adamw"
-    betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = 0.0
-    gradient_clip: float = 1.0
-    average_over_scans: int = 1000
-    accumulate: int = 1
+    betas: tuple[ShareBelow1, ShareBelow1] = (0.9, 0.95)
+    weight_decay: Weight = 0.0
+    gradient_clip: Weight = 1.0
+    average_over_scans: NotNegative = 1000
+    accumulate: Count = 1
     precision: Literal["fp32", "bf16", "auto"] = "fp32"
     recompute: bool = False
     compile: bool = False
     augmentations: tuple[Augmentation, ...] = ()
     any_columns: bool = False
-    validate_every: int = 1000
-    validation_scans: int = 64
-    checkpoint_every: int = 1000
-    pictures_every: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("scans", "batch_size", "accumulate", "validate_every", "validation_scans", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
-        for name in ("warmup_scans", "weight_decay", "gradient_clip", "average_over_scans", "pictures_every"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
-        if self.batch_size > _BATCH_AT_MOST:
-            raise ConfigError(f"batch_size={self.batch_size}", f"at most {_BATCH_AT_MOST}", "lower it")
-        if not all(0 <= beta < 1 for beta in self.betas):
-            raise ConfigError(f"betas={self.betas}", "two numbers in [0, 1)", "e.g. [0.9,0.95]")
-        if not self.learning_rate > 0:
-            raise ConfigError(f"learning_rate={self.learning_rate}", "a positive number", "raise it")
+    validate_every: Count = 1000
+    validation_scans: Count = 64
+    checkpoint_every: Count = 1000
+    pictures_every: NotNegative = 0
 
 
 @dataclass(frozen=True)
-class Preset:
+class Preset(Settings):
     """One experiment.
 
     Args:
@@ -110,7 +98,7 @@ class Preset:
     model: Any
     data: DataConfig
     training: dict[str, TrainingConfig]
-    seed: int = 0
+    seed: NotNegative = 0
     published: str = ""
     tokenizer_from: str | None = None
     stages_from: str | None = None
@@ -118,6 +106,7 @@ class Preset:
     fine_tune: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for setting in ("tokenizer_from", "stages_from"):
             if getattr(self, setting) == "":  # not the current folder
                 object.__setattr__(self, setting, None)
@@ -134,8 +123,6 @@ class Preset:
                     "the run that has this stage",
                     "set stages_from as well",
                 )
-        if self.seed < 0:
-            raise ConfigError(f"seed={self.seed}", "0 or more", "choose another seed")
 
     def settings_of(self, stage: str) -> TrainingConfig:
         """Return the settings of a stage's training.

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.encoding_cache import EncodingCache, Frozen
 from lidargrit.generation.facts import Cost
@@ -20,7 +21,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
-from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.precision import Precision, without_autocast
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
 from lidargrit.scans.bits import ScanBits
@@ -37,8 +38,45 @@ PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
 """How the pixels of sampled tokens are decided: by the pixel decoder, or by the tokenizer's decoder alone."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class DecodingOfTokens(Settings):
+    """Settings by which range images are made of sampled tokens, whatever samples the tokens.
+
+    Args:
+        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
+            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
+            decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
+            return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
+            decoder, and ``bernoulli`` elsewhere.
+        range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
+            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
+            with 1, a noise of 1, a correlation of 0 and a guidance of 1 follow the distribution whose likelihood the
+            model gives.
+        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
+        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
+            sampled at once; 0 samples them independently.
+        decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
+            quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
+            has instructions for it.
+    """
+
+    mask: PixelChoice = "auto"
+    range_temperature: float = PixelSampling.range_temperature
+    range_noise: float = PixelSampling.range_noise
+    mask_correlation: float = PixelSampling.mask_correlation
+    decoder: Precision = "fp32"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.pixels()
+
+    def pixels(self) -> PixelSampling:
+        """Return the settings of the pixel decoder."""
+        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
+
+
 @dataclass(frozen=True)
-class TokenGeneratorConfig:
+class TokenGeneratorConfig(Settings):
     """The networks of a generator of tokens.
 
     Args:

@@ -5,12 +5,15 @@ reference's state dict (a minGPT), so that published weights load.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, ShareBelow1
 from lidargrit.nn.attention import attend
 from lidargrit.nn.blocks import Block, Network
 
@@ -18,7 +21,7 @@ _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
 
 
 @dataclass(frozen=True)
-class TransformerConfig:
+class TransformerConfig(Settings):
     """Sizes of the transformer; the defaults are the paper's for KITTI odometry.
 
     Args:
@@ -30,25 +33,18 @@ class TransformerConfig:
         attention_dropout: probability of dropout on attention weights.
     """
 
-    layers: int = 6
-    heads: int = 8
-    width: int = 256
-    embedding_dropout: float = 0.2
-    residual_dropout: float = 0.0
-    attention_dropout: float = 0.0
+    layers: Annotated[int, Bounds(1, _LAYERS_AT_MOST)] = 6
+    heads: Count = 8
+    width: Count = 256
+    embedding_dropout: ShareBelow1 = 0.2
+    residual_dropout: ShareBelow1 = 0.0
+    attention_dropout: ShareBelow1 = 0.0
 
     def __post_init__(self) -> None:
-        if self.layers > _LAYERS_AT_MOST:
-            raise ConfigError(f"layers={self.layers}", f"at most {_LAYERS_AT_MOST}", "lower it")
-        if self.layers < 1 or self.heads < 1 or self.width < 1 or self.width % self.heads:
-            raise ConfigError(
-                f"layers={self.layers}, heads={self.heads}, width={self.width}",
-                "positive numbers, the width a multiple of the heads",
-                "change the width or the heads",
-            )
-        for name in ("embedding_dropout", "residual_dropout", "attention_dropout"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "a share in [0, 1)", "lower it")
+        super().__post_init__()
+        if self.width % self.heads:
+            got = f"heads={self.heads}, width={self.width}"
+            raise ConfigError(got, "a width that is a multiple of the heads", "change the width or the heads")
 
 
 class Transformer(Network):

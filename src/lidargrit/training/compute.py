@@ -21,7 +21,7 @@ from lidargrit.nn.precision import Precision
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.training.taken_stages import donors_of_stages
+from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
@@ -78,7 +78,7 @@ def stage_costs(preset: Preset, taken: Collection[str] | None = None) -> dict[st
         with torch.device("meta"):
             generator = preset.build_generator(sensor).to("meta")
         costs = {}
-        taken = donors_of_stages(preset, generator.stages) if taken is None else taken
+        taken = donors_of_stages(preset, taken_stages(preset, generator)) if taken is None else taken
         for stage in (name for name in generator.stages if name not in taken):
             try:
                 costs[stage] = _cost_without_values(preset, generator, stage, sensor)

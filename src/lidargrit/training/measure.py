@@ -1,6 +1,7 @@
 """A preset → the time and memory of its training on this machine, predicted from a few timed steps of each stage."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -42,11 +43,15 @@ class Measured:
         )
 
 
-def measure(preset: Preset) -> list[Measured]:
-    """Take a few steps of every stage that is trained; predict the time of all, without reading and validation."""
+def measure(preset: Preset, flops: Mapping[str, int] | None = None) -> list[Measured]:
+    """Take a few steps of every stage that is trained; predict the time of all, without reading and validation.
+
+    Args:
+        flops: operations of each stage that is trained, as a plan has counted them; counted here if not given.
+    """
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
-        flops = training_flops(preset)
+        flops = training_flops(preset) if flops is None else flops
         generator, condition = preset.build_generator(), conditions.load(preset.data.condition)
         found = []
         for stage in flops:  # those that are trained

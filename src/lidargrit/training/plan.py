@@ -67,6 +67,11 @@ class TrainingPlan:
     range_m: tuple[float, float]
     stages: tuple[StagePlan, ...]
 
+    @property
+    def flops(self) -> dict[str, int]:
+        """Number of floating-point operations of each stage that is trained."""
+        return {stage.name: stage.flops for stage in self.stages if not stage.taken_from}
+
     def as_text(self) -> str:
         """Return all of it as lines for a person."""
         lines = [self.title, f"published: {self.published or 'no score'}", ""]
@@ -121,11 +126,13 @@ class CheckedStages:
 
     Args:
         objectives: objective of every stage, without values, by the name of the stage.
+        taken: trained stages of another run, which are taken as they are or trained further.
         donors: run from which a stage is taken as it is, by the name of the stage; the others are trained.
         told: source of the condition that the generator is told of each scan.
     """
 
     objectives: Mapping[str, Objective]
+    taken: Mapping[str, Objective]
     donors: Mapping[str, str]
     told: ToldOfScans
 
@@ -156,13 +163,13 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = preset.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
-    donors = donors_of_stages(preset, generator.stages)
-    taken_stages(preset, generator)
+    taken = taken_stages(preset, generator)
+    donors = donors_of_stages(preset, taken)
     told = conditions.load(preset.data.condition)
     if told.kind is not Nothing and told.kind not in generator.takes:
         got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, which cannot be told it"
         raise ConfigError(got, "a generator that takes it", "leave it out")
-    checked = CheckedStages(objectives, donors, told)
+    checked = CheckedStages(objectives, taken, donors, told)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)
     return checked

@@ -28,7 +28,7 @@ from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.engine import Engine
 from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data
 from lidargrit.training.stage import StageTraining
-from lidargrit.training.taken_stages import taken_facts, taken_stages
+from lidargrit.training.taken_stages import taken_facts
 from lidargrit.training.tracking import tracked
 
 _IMAGES = "_images"  # of a hash of images, in place of their names
@@ -95,14 +95,14 @@ def _train(
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
         torch.manual_seed(derive_seed(preset.seed, 9))
         generator = preset.build_generator()
-        taken = taken_stages(preset, generator)
         engine.by_first(lambda: _claim(folder, preset, checked.donors, train_images, val_images))
         generator.fit_statistics(train_images)
 
         def training_of(number: int, stage: str, built_on: str) -> StageTraining:
             seed, objective = derive_seed(preset.seed, number), generator.objective(stage)
-            if stage in taken:
-                objective.load_state_dict({**objective.state_dict(), **objective.weights_from(taken[stage])})
+            if stage in checked.taken:
+                taken = objective.weights_from(checked.taken[stage])
+                objective.load_state_dict({**objective.state_dict(), **taken})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = preset.data.workers, preset.settings_of(stage)
             of_stage = (objective, config, folder / stage, seed, built_on, workers, checked.told, picture)
@@ -111,7 +111,7 @@ def _train(
         built_on = ""
         for number, stage in enumerate(generator.stages):
             if stage in checked.donors:
-                trained = taken[stage]
+                trained = checked.taken[stage]
             else:
                 trained = training_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
             generator.load_stage(stage, trained)

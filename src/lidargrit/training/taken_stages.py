@@ -1,6 +1,6 @@
 """Trained stages of another run that a preset takes as they are: preset → objectives by the name of their stage."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +20,14 @@ _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in t
 _NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
 
 
-def donors_of_stages(preset: Preset, stages: Sequence[str]) -> dict[str, str]:
-    """Return the run from which each stage is taken as it is, by the name of the stage; others are trained.
+def donors_of_stages(preset: Preset, taken: Iterable[str]) -> dict[str, str]:
+    """Return the run of each stage that is taken as it is and not trained further, by the name of the stage.
 
     Args:
-        stages: names of the stages of the preset's generator.
+        taken: names of :func:`taken_stages`.
     """
-    if preset.tokenizer_from is not None:
-        return {"tokenizer": preset.tokenizer_from}
-    if preset.stages_from is None:
-        return {}
-    theirs = load(Path(preset.stages_from)).stages
-    trained = {*preset.train_anew, *preset.fine_tune}
-    return {stage: preset.stages_from for stage in stages if stage in theirs and stage not in trained}
+    run = preset.tokenizer_from or preset.stages_from or ""
+    return {stage: run for stage in taken if stage not in preset.fine_tune}
 
 
 def taken_facts(preset: Preset, donors: Mapping[str, str]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.training import check_folder, train
 from lidargrit.training.fine_tuning import divided
 from lidargrit.training.log import LOG_FILE, read_log
-from lidargrit.training.taken_stages import donors_of_stages
+from lidargrit.training.plan import check_stages
 from lidargrit.viewer import plot_comparison
 from lidargrit.viewer.demo_page import DemoPage, write_demo_page
 from lidargrit.viewer.scan_sets import ScanSet
@@ -233,7 +233,7 @@ def _preset(data: str | None, settings: list[str], anew: bool) -> Preset:
 
 
 def _trained_stages(preset: Preset) -> list[str]:
-    donors = donors_of_stages(preset, tuple(_STAGES))
+    donors = check_stages(preset).donors
     return [stage for stage in _STAGES if stage in preset.training and stage not in donors]
 
 

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
-from lidargrit.core.configuration import override
+from lidargrit.core.configuration import Settings, override
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.data.formats import BadPoints
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import ProjectionOption, SensorModel, load_sensor
 
 
 @dataclass(frozen=True)
-class DataConfig:
+class DataConfig(Settings):
     """Which scans are read, and how they become range images.
 
     Args:
@@ -33,24 +34,21 @@ class DataConfig:
     train: tuple[str, ...] = ()
     val: tuple[str, ...] = ()
     sensor: str = "hdl64e_kitti_odometry"
-    columns: int = 0
-    column_stride: int = 1
+    columns: NotNegative = 0
+    column_stride: Count = 1
     projection: ProjectionOption = "sensor"
     projection_variant: ProjectionVariant = "exact"
     condition: str = "nothing"
-    max_scans: int = 0
+    max_scans: NotNegative = 0
     bad_points: BadPoints = "refuse"
     bad_scans: Literal["refuse", "skip"] = "refuse"
-    workers: int = 2
+    workers: Annotated[int, Bounds(1, 1024)] = 2
 
     def __post_init__(self) -> None:
-        if self.max_scans < 0:
-            raise ConfigError(f"max_scans={self.max_scans}", "at least 1, or 0 for all", "raise it")
+        super().__post_init__()
         if self.column_stride != 1 and not self.columns:
             got = f"column_stride={self.column_stride} without columns"
             raise ConfigError(got, "both, or neither", "give the number of fine columns too, as columns=2048")
-        if not 1 <= self.workers <= 1024:
-            raise ConfigError(f"workers={self.workers}", "1 to 1024", "choose about as many as there are cores")
 
     def load_sensor(self) -> SensorModel:
         """Return the sensor with these columns and this projection."""

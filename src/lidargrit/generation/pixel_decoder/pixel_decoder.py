@@ -3,16 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import is_temperature
+from lidargrit.core.typed_values import Bounds, Temperature, Weight
 from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
@@ -36,7 +36,7 @@ BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centim
 
 
 @dataclass(frozen=True)
-class PixelSampling(TypedSettings):
+class PixelSampling(Settings):
     """Settings of sampling masks, and ranges from their mixtures.
 
     By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
@@ -54,29 +54,10 @@ class PixelSampling(TypedSettings):
             ``auto`` is ``bf16`` where the machine has instructions for it.
     """
 
-    range_temperature: float = 0.0
-    range_noise: float = 0.7
-    mask_correlation: float = 2.0
+    range_temperature: Temperature = 0.0
+    range_noise: Annotated[float, Bounds(above=0, most=_NOISE_AT_MOST)] = 0.7
+    mask_correlation: Weight = 2.0
     precision: Precision = "fp32"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (
-            is_temperature(self.range_temperature)
-            and self.range_temperature < math.inf
-            and 0 < self.range_noise <= _NOISE_AT_MOST
-        ):
-            raise ConfigError(
-                f"range_temperature={self.range_temperature}, range_noise={self.range_noise}",
-                "positive numbers, a temperature of at least 1e-6, or of 0 for the model's own, a noise up to 1e6",
-                "take 1 for both, and mask_correlation=0, to sample from the model's own distribution",
-            )
-        if not 0 <= self.mask_correlation < math.inf:
-            raise ConfigError(
-                f"mask_correlation={self.mask_correlation}",
-                "a number that is at least 0",
-                "take 0 for independent pixels",
-            )
 
 
 class PixelNll(NamedTuple):

@@ -1,16 +1,17 @@
 """The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
 from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
 from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
@@ -36,7 +37,7 @@ _DECODED_LOG_SCALE_M = -3.0  # 5 cm
 
 
 @dataclass(frozen=True)
-class PixelDecoderConfig:
+class PixelDecoderConfig(Settings):
     """Sizes of the pixel decoder.
 
     Args:
@@ -66,30 +67,23 @@ class PixelDecoderConfig:
             depends on its columns and its training: choose it by samples against validation scans.
     """
 
-    coarsest_cell: int = 8
-    column_halvings: int = 0
-    row_halvings: int = 0
-    mask_features: int = 12
-    range_features: int = 12
-    row_channels: int = 4
-    mask_width: int = 32
-    range_width: int = 48
-    coarse_range_width: int = 0
-    blocks: int = 2
+    coarsest_cell: Count = 8
+    column_halvings: Annotated[int, Bounds(0, _HALVINGS_AT_MOST)] = 0
+    row_halvings: Annotated[int, Bounds(0, _HALVINGS_AT_MOST)] = 0
+    mask_features: Count = 12
+    range_features: Count = 12
+    row_channels: Count = 4
+    mask_width: Count = 32
+    range_width: Count = 48
+    coarse_range_width: NotNegative = 0
+    blocks: Count = 2
     surface_components: bool = False
     gravity_components: bool = False
     decoded_components: bool = False
-    range_temperature: float = 0.35
+    range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
 
     def __post_init__(self) -> None:
-        if not TEMPERATURE_AT_LEAST <= self.range_temperature < math.inf:
-            raise ConfigError(f"range_temperature={self.range_temperature}", "at least 1e-6", "correct it")
-        for name, value in vars(self).items():
-            least = 0 if isinstance(value, (bool, float)) or name in _MAY_BE_0 else 1
-            if value < least:
-                raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
-            if name.endswith("halvings") and value > _HALVINGS_AT_MOST:
-                raise ConfigError(f"{name}={value}", f"at most {_HALVINGS_AT_MOST}", "lower it")
+        super().__post_init__()
         phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
 
 

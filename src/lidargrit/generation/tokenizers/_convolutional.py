@@ -2,31 +2,23 @@
 
 from abc import abstractmethod
 from collections.abc import Iterable
+from typing import Annotated
 
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds
 from lidargrit.generation.tokenizers import CodebookTokenizer, Config
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import Convolution
 from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.scans.types import RangeImage
 
-
-def check_sizes(channels: int, residual_blocks: int, code_dim: int, num_codes: int, norm_groups: int = 32) -> None:
-    """Refuse sizes of which no network can be built."""
-    if norm_groups < 1:
-        raise ConfigError(f"norm_groups={norm_groups}", "at least 1", "32 are published")
-    if channels < 1 or channels % norm_groups:
-        wanted, cure = f"a positive multiple of {norm_groups}", f"the norms share {norm_groups} groups: round it up"
-        raise ConfigError(f"channels={channels}", wanted, cure)
-    sizes = {"residual_blocks": residual_blocks, "code_dim": code_dim, "num_codes": num_codes}
-    most = {"residual_blocks": 100, "code_dim": 16_384, "num_codes": 65_536}
-    for name, size in sizes.items():
-        if not 1 <= size <= most[name]:
-            raise ConfigError(f"{name}={size}", f"1 to {most[name]}", "correct it")
+ResidualBlocks = Annotated[int, Bounds(1, 100)]
+CodeDim = Annotated[int, Bounds(1, 16_384)]
+NumCodes = Annotated[int, Bounds(1, 65_536)]
 
 
 class Level(nn.Module):

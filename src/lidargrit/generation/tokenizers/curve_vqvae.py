@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
@@ -11,13 +11,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, Positive
 from lidargrit.generation.tokenizers import TokenizerConfig
 from lidargrit.generation.tokenizers._convolutional import (
+    CodeDim,
     ConvolutionalDecoder,
     ConvolutionalEncoder,
     ConvolutionalTokenizer,
     Level,
-    check_sizes,
+    NumCodes,
+    ResidualBlocks,
 )
 from lidargrit.nn.blocks import Block
 from lidargrit.nn.convolution import Convolution, Downsample, ResidualBlock, group_norm
@@ -60,30 +63,34 @@ class CurveVqvaeConfig(TokenizerConfig):
             channels of a small network in 32 groups know of no mean level.
     """
 
-    channels: int = 64
-    channel_multipliers: tuple[int, ...] = (1, 2, 2, 4)
-    row_strides: tuple[int, ...] = (1, 2, 2)
-    residual_blocks: int = 2
-    code_dim: int = 8
-    num_codes: int = 16_384
+    channels: Count = 64
+    channel_multipliers: Annotated[tuple[Count, ...], Bounds(1, 16)] = (1, 2, 2, 4)
+    row_strides: tuple[Literal[1, 2], ...] = (1, 2, 2)
+    residual_blocks: ResidualBlocks = 2
+    code_dim: CodeDim = 8
+    num_codes: NumCodes = 16_384
     range_encoding: Literal["log", "linear"] = "log"
-    range_scale: float = 5.84
+    range_scale: Positive = 5.84
     mask_head: bool = False
     codebook_loss: CodebookLoss = "reference"
     restart_dead_codes: bool = False
-    norm_groups: int = 32
+    norm_groups: Count = 32
 
     def __post_init__(self) -> None:
-        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes, self.norm_groups)
+        super().__post_init__()
+        if self.channels % self.norm_groups:
+            raise ConfigError(
+                f"channels={self.channels}", f"a multiple of norm_groups={self.norm_groups}", "round it up"
+            )
         multipliers, strides = self.channel_multipliers, self.row_strides
-        if len(strides) > 15 or {*strides} - {1, 2} or len(multipliers) != len(strides) + 1 or min(multipliers) < 1:
+        if len(multipliers) != len(strides) + 1:
             raise ConfigError(
                 f"channel_multipliers={multipliers}, row_strides={strides}",
-                "one stride, 1 or 2, between each two of at most 16 positive multipliers",
+                "one stride between each two multipliers",
                 "e.g. channel_multipliers=(1,2,2,4) row_strides=(1,2,2)",
             )
-        if not 0 < self.range_scale < math.inf or (self.range_encoding == "log" and self.range_scale > 16):
-            raise ConfigError(f"range_scale={self.range_scale}", "above 0, at most 16 for log", "5.84 is published")
+        if self.range_encoding == "log" and self.range_scale > 16:
+            raise ConfigError(f"range_scale={self.range_scale}", "at most 16 for log", "5.84 is published")
 
     def widths(self) -> list[int]:
         """Return the channels of every level, from fine to coarse."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig
 from lidargrit.nn.convolution import Convolution, Residual
@@ -39,32 +41,24 @@ class NearestRangeConfig(TokenizerConfig):
         features: number of channels of each pixel, from which its range and its return are read.
     """
 
-    cell_rows: int = 8
-    cell_columns: int = 2
-    part_rows: int = 2
-    part_columns: int = 2
-    levels: int = 128
-    width: int = 64
-    blocks: int = 4
-    features: int = 16
+    cell_rows: Annotated[int, Bounds(1, 64)] = 8
+    cell_columns: Annotated[int, Bounds(1, 64)] = 2
+    part_rows: Count = 2
+    part_columns: Count = 2
+    levels: Annotated[int, Bounds(2)] = 128
+    width: Annotated[int, Bounds(1, 4096)] = 64
+    blocks: Annotated[int, Bounds(1, 100)] = 4
+    features: Annotated[int, Bounds(1, 512)] = 16
 
     def __post_init__(self) -> None:
-        for name, most in (
-            ("cell_rows", 64),
-            ("cell_columns", 64),
-            ("width", 4096),
-            ("blocks", 100),
-            ("features", 512),
-        ):
-            if not 1 <= getattr(self, name) <= most:
-                raise ConfigError(f"{name}={getattr(self, name)}", f"1 to {most}", "correct it")
+        super().__post_init__()
         for parts, whole in (("part_rows", "cell_rows"), ("part_columns", "cell_columns")):
-            if getattr(self, parts) < 1 or getattr(self, whole) % getattr(self, parts):
+            if getattr(self, whole) % getattr(self, parts):
                 got = f"{parts}={getattr(self, parts)} of {whole}={getattr(self, whole)}"
                 raise ConfigError(got, "parts of equal size", f"choose a divisor of {whole}")
-        if self.levels < 2 or self.num_codes > _CODES_AT_MOST:
+        if self.num_codes > _CODES_AT_MOST:
             got = f"levels={self.levels} in {self.part_rows * self.part_columns} parts"
-            raise ConfigError(got, f"at least 2 levels, and at most {_CODES_AT_MOST} codes", "lower levels or parts")
+            raise ConfigError(got, f"at most {_CODES_AT_MOST} codes", "lower levels or parts")
 
     @property
     def num_patterns(self) -> int:

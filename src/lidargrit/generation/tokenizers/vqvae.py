@@ -5,7 +5,7 @@ import math
 from collections import OrderedDict
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
@@ -13,14 +13,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative, ShareBelow1, Weight
 from lidargrit.generation.reflectance import required_reflectance
 from lidargrit.generation.tokenizers import TokenizerConfig
 from lidargrit.generation.tokenizers._convolutional import (
+    CodeDim,
     ConvolutionalDecoder,
     ConvolutionalEncoder,
     ConvolutionalTokenizer,
     Level,
-    check_sizes,
+    NumCodes,
+    ResidualBlocks,
 )
 from lidargrit.nn.convolution import (
     Convolution,
@@ -86,42 +89,31 @@ class VqvaeConfig(TokenizerConfig):
             collapse; the reference has no such remedy.
     """
 
-    channels: int = 64
-    channel_multipliers: tuple[int, ...] = (1, 1, 2)
-    cell_columns: int = 0
-    residual_blocks: int = 1
-    code_dim: int = 128
-    num_codes: int = 512
-    dropout: float = 0.2
+    channels: Annotated[int, Bounds(32, multiple_of=32)] = 64  # the norms share 32 groups
+    channel_multipliers: Annotated[tuple[Count, ...], Bounds(1, _LEVELS_AT_MOST)] = (1, 1, 2)
+    cell_columns: NotNegative = 0
+    residual_blocks: ResidualBlocks = 1
+    code_dim: CodeDim = 128
+    num_codes: NumCodes = 512
+    dropout: ShareBelow1 = 0.2
     padding: Padding = "zero"
     range_encoding: Literal["linear", "log", "inverse"] = "linear"
     raydrop_loss: bool = True
-    raydrop_weight: float = 0.1
+    raydrop_weight: Weight = 0.1
     reconstruction: Literal["paper", "reference", "returns"] = "paper"
     error_unit: Literal["encoded", "metres"] = "encoded"
-    thin_weight: float = 0.0
+    thin_weight: Weight = 0.0
     reflectance: bool = False
-    reflectance_weight: float = 1.0
+    reflectance_weight: Weight = 1.0
     codebook_loss: CodebookLoss = "paper"
     restart_dead_codes: bool = True
 
     def __post_init__(self) -> None:
-        check_sizes(self.channels, self.residual_blocks, self.code_dim, self.num_codes)
-        if not 1 <= len(self.channel_multipliers) <= _LEVELS_AT_MOST or min(self.channel_multipliers) < 1:
-            raise ConfigError(
-                f"channel_multipliers={self.channel_multipliers}",
-                f"1 to {_LEVELS_AT_MOST} positive numbers, one a level",
-                "e.g. (1,1,2)",
-            )
+        super().__post_init__()
         if self.cell_columns not in (0, *(2**halvings for halvings in range(len(self.channel_multipliers)))):
             rows = 2 ** (len(self.channel_multipliers) - 1)
             wanted = f"a power of 2 up to the {rows} rows of a cell, or 0 for as many"
             raise ConfigError(f"cell_columns={self.cell_columns}", wanted, "lower it, or add channel_multipliers")
-        if not 0 <= self.dropout < 1:
-            raise ConfigError(f"dropout={self.dropout}", "a share in [0, 1)", "lower it")
-        for name in ("raydrop_weight", "reflectance_weight", "thin_weight"):
-            if not getattr(self, name) >= 0:
-                raise ConfigError(f"{name}={getattr(self, name)}", "0 or more", "raise it")
 
     @property
     def cell(self) -> tuple[int, int]:

@@ -2,22 +2,23 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, nearest_names
+from lidargrit.core.typed_values import Bounds, fits, in_words
 from lidargrit.scans.sensors._columns import column_azimuths_rad, mean_azimuths_rad
 
-_WORDS = ("name", "source", "projection")
-_NUMBERS: dict[str, Any] = {
-    **dict.fromkeys(("range_min_m", "range_max_m", "first_edge_rad"), (int, float)),
+_Number = Annotated[float, Bounds(-1e9, 1e9)]  # anything larger is no number of a sensor
+_VALUES: dict[str, Any] = {
+    **dict.fromkeys(("name", "source", "projection"), str),
+    **dict.fromkeys(("range_min_m", "range_max_m", "first_edge_rad"), _Number),
     "column_stride": int,
 }
 _TABLES = {"elevation_rad": 2, "azimuth_rad": 2, "azimuth_offset_rad": 1}  # with their dimensions
 _MAY_BE_LEFT_OUT = {"source", "column_stride", "azimuth_offset_rad", "first_edge_rad"}
-_NUMBER_AT_MOST = 1e9  # anything larger is no number of a sensor, and some are too large to become a float
 _ROWS_AT_MOST = 4096  # sensors have up to 256 lasers; a table beyond this is a mistake that would fill the memory
 FINE_COLUMNS_AT_MOST = 65536  # sensors fire up to 4096 times a revolution
 _PIXELS_AT_MOST = (
@@ -123,7 +124,7 @@ def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
     """Return the entries of a sensor's JSON, its tables as tensors and its metres as floats."""
     if not isinstance(data, dict):
         raise ConfigError(f"a {type(data).__name__} instead of a sensor", "named entries, {...}", _CURE)
-    known = {*_WORDS, *_NUMBERS, *_TABLES}
+    known = {*_VALUES, *_TABLES}
     if missing := sorted(known - _MAY_BE_LEFT_OUT - data.keys()):
         raise ConfigError(f"a sensor without {', '.join(missing)}", "every entry", _CURE)
     if unknown := sorted(str(key) for key in data if key not in known):
@@ -138,19 +139,13 @@ def checked_entries(data: Any, projections: Sequence[str]) -> dict[str, Any]:
 
 
 def _checked(key: str, value: Any) -> Any:
-    if key in _WORDS:
-        if not isinstance(value, str):
-            raise ConfigError(f"a {type(value).__name__} for a sensor's {key}", "words", _CURE)
+    if key in _VALUES:
+        if not fits(_VALUES[key], value):  # Python refuses to print a whole number of any length: so no value here
+            raise ConfigError(f"no usable value for a sensor's {key}", in_words(_VALUES[key]), _CURE)
         if key == "name" and not (0 < len(value) <= NAME_AT_MOST and value.isprintable()):  # pictures show it
             what = f"{len(value)} letters{'' if value.isprintable() else ', not all of which can be printed,'}"
             raise ConfigError(f"{what} for a sensor's name", f"1 to {NAME_AT_MOST} letters in one line", _CURE)
-        return value
-    if key in _NUMBERS:
-        # A whole number of any length is JSON, and printing a long one is refused by Python itself: so no value here.
-        if isinstance(value, bool) or not isinstance(value, _NUMBERS[key]) or not abs(value) < _NUMBER_AT_MOST:
-            what = "a whole number" if _NUMBERS[key] is int else "a number"
-            raise ConfigError(f"no usable number for a sensor's {key}", f"{what} of ordinary size", _CURE)
-        return value if _NUMBERS[key] is int else float(value)
+        return float(value) if _VALUES[key] is _Number else value
     try:
         table = torch.tensor(value, dtype=torch.float32)
     except (TypeError, ValueError, RuntimeError, OverflowError):  # words among the numbers, rows of several lengths

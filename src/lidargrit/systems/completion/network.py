@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
@@ -35,7 +37,7 @@ _ONE_SURFACE = 0.1  # of ln(1 + range): a return so much farther or nearer than 
 
 
 @dataclass(frozen=True)
-class CompletionNetworkConfig:
+class CompletionNetworkConfig(Settings):
     """Sizes of the network that completes scans.
 
     Args:
@@ -53,20 +55,18 @@ class CompletionNetworkConfig:
             that of the others.
     """
 
-    widths: tuple[int, int, int] = (48, 64, 128)
-    blocks: int = 4
-    attention_layers: int = 2
-    heads: int = 4
-    features: int = 32
-    mask_width: int = 24
-    row_channels: int = 2
+    widths: tuple[Count, Count, Count] = (48, 64, 128)
+    blocks: Count = 4
+    attention_layers: NotNegative = 2
+    heads: Count = 4
+    features: Count = 32
+    mask_width: Count = 24
+    row_channels: Count = 2
     labels: bool = False
     reflectance: bool = False
 
     def __post_init__(self) -> None:
-        sizes = (*self.widths, self.blocks, self.heads, self.features, self.mask_width, self.row_channels)
-        if min(sizes) < 1 or self.attention_layers < 0:
-            raise ConfigError(f"{self}", "sizes of at least 1", "raise the one that is lower")
+        super().__post_init__()
         if self.attention_layers > self.blocks or self.widths[-1] % self.heads:
             raise ConfigError(
                 f"{self.attention_layers} layers of attention of {self.heads} heads, {self.widths[-1]} channels",

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -18,7 +19,7 @@ from lidargrit.systems.completion.objective import CompletionObjective
 
 
 @dataclass(frozen=True)
-class CompletionConfig:
+class CompletionConfig(Settings):
     """The network, which is the whole system.
 
     Args:
@@ -36,6 +37,7 @@ class Completion(Generator[CompletionConfig, NoSampling]):
     """
 
     Config = CompletionConfig
+    trains = (("completion", "completion"),)
     facts = SystemFacts(
         generates="range as a best guess and raydrop around observed pixels; no scans worth sampling",
         first_command="complete SCANS completed --observed rows:4 --model RUN",
@@ -52,18 +54,9 @@ class Completion(Generator[CompletionConfig, NoSampling]):
         sizes = CompletionNetworkConfig((8, 8, 8), blocks=1, attention_layers=1, heads=2, features=4, mask_width=4)
         return CompletionConfig(sizes)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The network alone."""
-        return ("completion",)
-
     def objective(self, stage: str) -> Objective:
         """Return the errors of hidden pixels."""
         return CompletionObjective(self.completion, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.completion.load_state_dict(objective.get_submodule(stage).state_dict())
 
     @property
     def takes(self) -> frozenset[type[Condition]]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.func import functional_call
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative, Weight
 from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -46,7 +47,7 @@ _PUBLISHED_BYTES_AT_MOST = 2**29  # weights, their average and the optimiser of 
 
 
 @dataclass(frozen=True)
-class DustyConfig:
+class DustyConfig(Settings):
     """Networks and losses of DUSty v1; the defaults are the published ones but for two that are named.
 
     Args:
@@ -64,23 +65,16 @@ class DustyConfig:
     """
 
     variant: DustyVariant = "dusty_1"
-    latent_dim: int = 512
-    channels: int = 64
-    max_channels: int = 512
-    penalty_weight: float = 1.0
-    penalty_every: int = 16
+    latent_dim: Count = 512
+    channels: Count = 64
+    max_channels: Count = 512
+    penalty_weight: Weight = 1.0
+    penalty_every: Count = 16
     augmentations: tuple[DifferentiableAugmentation, ...] = ("brightness", "contrast", "translation", "cutout")
-
-    def __post_init__(self) -> None:
-        for name in ("latent_dim", "channels", "max_channels", "penalty_every"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
-        if not self.penalty_weight >= 0:
-            raise ConfigError(f"penalty_weight={self.penalty_weight}", "0 or more", "raise it")
 
 
 @dataclass(frozen=True)
-class DustySampling(TypedSettings):
+class DustySampling(Settings):
     """Settings of sampling, and of the search for the latent of a scan.
 
     Args:
@@ -96,20 +90,10 @@ class DustySampling(TypedSettings):
     """
 
     mask: MaskDecoding = "bernoulli"
-    raydrop_seed: int = 0
-    tolerance: float | None = None
-    search_steps: int = 1000
-    search_rate: float = 0.1
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.search_steps > SEARCH_STEPS_AT_MOST:
-            got = f"search_steps={self.search_steps}"
-            raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
-        for name, least in (("raydrop_seed", 0), ("tolerance", 0), ("search_steps", 1), ("search_rate", 0)):
-            value = getattr(self, name)
-            if value is not None and not value >= least:
-                raise ConfigError(f"{name}={value}", f"at least {least}", "raise it")
+    raydrop_seed: NotNegative = 0
+    tolerance: Weight | None = None
+    search_steps: Annotated[int, Bounds(1, SEARCH_STEPS_AT_MOST)] = 1000
+    search_rate: Weight = 0.1
 
 
 class Dusty(Generator[DustyConfig, DustySampling]):
@@ -121,6 +105,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     """
 
     Config = DustyConfig
+    trains = (("adversarial", "synthesis"),)
     facts = SystemFacts(
         generates="range and raydrop, sampled over a scan without holes",
         paper="Nakashima and Kurazume, Learning to Drop Points for LiDAR Scan Synthesis, IROS 2021",
@@ -153,19 +138,9 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         """Return a search of 200 steps, by which a small model came as near to the truth as by the program's 1,000."""
         return DustySampling(search_steps=200)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage, of two players."""
-        return ("adversarial",)
-
     def objective(self, stage: str) -> Objective:
         """Return the losses of the network and of a discriminator."""
         return AdversarialObjective(self.synthesis, self.config, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network; its discriminator has done its work."""
-        assert isinstance(objective, AdversarialObjective)
-        self.synthesis.load_state_dict(objective.synthesis.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: DustySampling) -> RangeImage:
         return self._generate(self._latents(seeds), seeds, sampling)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -13,7 +14,7 @@ from lidargrit.scans.types import RangeImage
 
 
 @dataclass(frozen=True)
-class InterpolationConfig:
+class InterpolationConfig(Settings):
     """The method.
 
     Args:

@@ -1,11 +1,11 @@
 """LidarGAN's two convolutional networks, and the losses of GAN and VAE: latents → images, images → vectors."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds
 from lidargrit.nn.blocks import Network
 
 IMAGE_CHANNELS = 2  # horizontal distance and height
@@ -13,6 +13,8 @@ IMAGE_CHANNELS = 2  # horizontal distance and height
 AdversarialLoss = Literal["relativistic", "plain"]
 
 _SLOPE = 0.2  # of the leaky rectifier below 0
+
+InitialStd = Annotated[float, Bounds(above=0, most=1)]  # of new weights
 
 
 class Decoder(Network):
@@ -79,12 +81,6 @@ class Encoder(Network):
     def forward(self, images: Float[Tensor, "B 2 H W"]) -> Float[Tensor, "B outputs"]:
         """Return one vector for each image."""
         return self.out(self.main(images)).float()[..., 0, 0]
-
-
-def check_initial_std(initial_std: float) -> None:
-    """Refuse a standard deviation of new weights that is none."""
-    if not 0 < initial_std <= 1:
-        raise ConfigError(f"initial_std={initial_std}", "above 0, at most 1", "0.02 is published")
 
 
 def _coarsest(size: tuple[int, int]) -> tuple[int, int]:

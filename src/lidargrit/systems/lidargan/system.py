@@ -9,7 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.configuration import Settings
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.typed_values import Count
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -29,7 +31,7 @@ from lidargrit.systems.lidargan.networks import (
     AdversarialLoss,
     Decoder,
     Encoder,
-    check_initial_std,
+    InitialStd,
     discriminator_loss,
     generator_loss,
     without_counters,
@@ -39,7 +41,7 @@ _BYTES_AT_MOST = 1 << 29  # the published network takes 16 MB
 
 
 @dataclass(frozen=True)
-class LidarGanConfig:
+class LidarGanConfig(Settings):
     """Networks and loss of LidarGAN; the defaults are the published ones.
 
     Args:
@@ -53,18 +55,12 @@ class LidarGanConfig:
         initial_std: standard deviation of the new weights of both networks.
     """
 
-    latent_dim: int = 100
-    channels: int = 64
+    latent_dim: Count = 100
+    channels: Count = 64
     rows: int = 40
     first_row: int = 17
     loss: AdversarialLoss = "relativistic"
-    initial_std: float = 0.02
-
-    def __post_init__(self) -> None:
-        for name in ("latent_dim", "channels"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)}", "at least 1", "raise it")
-        check_initial_std(self.initial_std)
+    initial_std: InitialStd = 0.02
 
 
 class LidarGan(Generator[LidarGanConfig, NoSampling]):
@@ -78,6 +74,7 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
     """
 
     Config = LidarGanConfig
+    trains = (("adversarial", "image", "decoder"),)
     facts = SystemFacts(
         generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
@@ -102,11 +99,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         """Rows that are generated."""
         return self.image.range
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage, of two players."""
-        return ("adversarial",)
-
     def fit_statistics(self, images: RangeImages) -> None:
         """Take the scale of the images from the training scans."""
         self.image.fit(images)
@@ -114,12 +106,6 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
     def objective(self, stage: str) -> Objective:
         """Return the losses of the network and of a discriminator."""
         return LidarGanObjective(self.decoder, self.image, self.config)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network and the scale of its images; its discriminator has done its work."""
-        assert isinstance(objective, LidarGanObjective)
-        self.image.load_state_dict(objective.image.state_dict())
-        self.decoder.load_state_dict(objective.decoder.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
         latents = normal_latents(seeds, self.config.latent_dim).to(self.device)

@@ -4,14 +4,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.typed_values import Bounds, Positive
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
@@ -44,7 +45,7 @@ _WINDOWS_M = {"frd": (0.5, 63.0), "bev": (3.0, 70.0), "sensor": (0.0, math.inf)}
 
 
 @dataclass(frozen=True)
-class LidarGenConfig:
+class LidarGenConfig(Settings):
     """Channels, network and noise levels of LiDARGen; the defaults are the published ones.
 
     Args:
@@ -58,27 +59,24 @@ class LidarGenConfig:
         steps_each: number of Langevin steps at each level, where the sampling settings do not say otherwise.
     """
 
-    channels: int = 128
+    channels: Annotated[int, Bounds(2)] = 128  # the norm compares channels
     reflectance: bool = True
-    log2_scale: float = 6.0
-    sigma_largest: float = 50.0
-    sigma_smallest: float = 0.01
+    log2_scale: Annotated[float, Bounds(above=0, most=16)] = 6.0
+    sigma_largest: Positive = 50.0
+    sigma_smallest: Positive = 0.01
     levels: int = 232
     steps_each: int = 5
 
     def __post_init__(self) -> None:
-        if self.channels < 2:  # the norm compares channels
-            raise ConfigError(f"channels={self.channels}", "at least 2", "raise it")
-        if not 0 < self.log2_scale <= 16:
-            raise ConfigError(f"log2_scale={self.log2_scale}", "above 0, at most 16", "6 is published")
-        if not 0 < self.sigma_smallest < self.sigma_largest < math.inf:
+        super().__post_init__()
+        if self.sigma_smallest >= self.sigma_largest:
             got = f"sigma_largest={self.sigma_largest}, sigma_smallest={self.sigma_smallest}"
-            raise ConfigError(got, "two positive numbers, the first the larger", "50 and 0.01 are published")
+            raise ConfigError(got, "two numbers, the first the larger", "50 and 0.01 are published")
         _check_counts(self.levels, self.steps_each)
 
 
 @dataclass(frozen=True)
-class LangevinSampling(TypedSettings):
+class LangevinSampling(Settings):
     """Settings of Langevin sampling, and of the window of ranges that count as returns.
 
     The published 232 levels, 5 steps and step size are those that the theory of Song and Ermon (2020) gives for 32x32
@@ -100,17 +98,13 @@ class LangevinSampling(TypedSettings):
 
     levels: int | None = None
     steps_each: int | None = None
-    step_lr: float | None = None
+    step_lr: Annotated[float, Bounds(above=0, below=1)] | None = None
     raydrop: Literal["frd", "bev", "sensor"] = "frd"
-    pull: float = 1.0
+    pull: Annotated[float, Bounds(above=0, most=1)] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_counts(2 if self.levels is None else self.levels, 1 if self.steps_each is None else self.steps_each)
-        if self.step_lr is not None and not 0 < self.step_lr < 1:
-            raise ConfigError(f"step_lr={self.step_lr}", "a number between 0 and 1", "6.2e-6 is published")
-        if not 0 < self.pull <= 1:
-            raise ConfigError(f"pull={self.pull}", "above 0, at most 1", "1 is published")
 
 
 class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
@@ -123,6 +117,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     Config = LidarGenConfig
     training_precision = "fp32"  # 16 bits round away the noise of the last levels
+    trains = (("score", "network"),)
     facts = SystemFacts(
         generates="range and reflectance; a range outside a window is no return",
         paper="Zyrianov, Zhu and Wang, Learning to Generate Realistic LiDAR Point Clouds, ECCV 2022",
@@ -156,19 +151,9 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         """Return one step at each of 2 levels, so small that an untrained network's values stay in the window."""
         return LangevinSampling(levels=2, steps_each=1, step_lr=1e-9)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("score",)
-
     def objective(self, stage: str) -> Objective:
         """Return the score matching of the network."""
         return ScoreMatching(self.network, self.sensor, self.config)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network."""
-        assert isinstance(objective, ScoreMatching)
-        self.network.load_state_dict(objective.network.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: LangevinSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.shape, self.device)

@@ -6,25 +6,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
-from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import is_temperature
+from lidargrit.core.typed_values import Bounds, NotNegative, Temperature
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.tokenizers import Tokenizer
-from lidargrit.generation.tokens import PixelChoice, TokenGenerator, TokenGeneratorConfig, TokenObjective
+from lidargrit.generation.tokens import (
+    DecodingOfTokens,
+    TokenGenerator,
+    TokenGeneratorConfig,
+    TokenObjective,
+)
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
 from lidargrit.nn.exact_weights import load_exactly
-from lidargrit.nn.precision import Precision
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import rngs_of, sample_index
 from lidargrit.nn.transformer import CausalTransformer
@@ -44,7 +45,7 @@ _GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
 
 
 @dataclass(frozen=True)
-class TokenSampling(TypedSettings):
+class TokenSampling(DecodingOfTokens):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -57,52 +58,15 @@ class TokenSampling(TypedSettings):
             of the same transformer without the attention of its last block but one, or of its only one. Above 1, scans
             and regions differ more from one another; 1 leaves the transformer's own distribution; 0 takes the model's
             setting (``model.guidance``).
-        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
-            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
-            decoded ranges (the released program, so what the paper's scores were computed with). ``threshold`` keeps a
-            return that is at least as likely as not (the paper's eq. 1). ``auto`` is ``pixels`` where there is a pixel
-            decoder, and ``bernoulli`` elsewhere.
-        range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
-            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
-            with 1, a noise of 1, a correlation of 0 and a guidance of 1 follow the distribution whose likelihood the
-            model gives.
-        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
-            sampled at once; 0 samples them independently.
         weights: number type of the transformer's weights. ``fp32`` is exact; ``bf16`` and ``int8`` (CPUs only) read
             less memory for a token and change probabilities a little, see docs/performance.md.
-        decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
-            quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
-            has instructions for it.
     """
 
-    temperature: float = 1.0
-    top_k: int = 0
-    top_p: float = 1.0
-    guidance: float = 0.0
-    mask: PixelChoice = "auto"
-    range_temperature: float = PixelSampling.range_temperature
-    range_noise: float = PixelSampling.range_noise
-    mask_correlation: float = PixelSampling.mask_correlation
+    temperature: Temperature = 1.0
+    top_k: NotNegative = 0
+    top_p: Annotated[float, Bounds(above=0, most=1)] = 1.0
+    guidance: Annotated[float, Bounds(1, _GUIDANCE_AT_MOST, or_0=True)] = 0.0
     weights: WeightPrecision = "fp32"
-    decoder: Precision = "fp32"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.pixels()
-        if not (is_temperature(self.temperature) and self.top_k >= 0 and 0 < self.top_p <= 1):
-            raise ConfigError(
-                f"temperature={self.temperature}, top_k={self.top_k}, top_p={self.top_p}",
-                "temperature 0 or at least 1e-6, top_k >= 0, 0 < top_p <= 1",
-                "correct the one that is out of bounds",
-            )
-        if self.guidance and not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
-            wanted = f"1 to {_GUIDANCE_AT_MOST}, or 0 for the model's own"
-            raise ConfigError(f"guidance={self.guidance}", wanted, "correct it")
-
-    def pixels(self) -> PixelSampling:
-        """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
 
 
 @dataclass(frozen=True)
@@ -114,11 +78,7 @@ class LidarGritConfig(TokenGeneratorConfig):
             model is found on validation scans.
     """
 
-    guidance: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.guidance <= _GUIDANCE_AT_MOST:
-            raise ConfigError(f"guidance={self.guidance}", f"1 to {_GUIDANCE_AT_MOST}", "correct it")
+    guidance: Annotated[float, Bounds(1, _GUIDANCE_AT_MOST)] = 1.0
 
 
 class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):

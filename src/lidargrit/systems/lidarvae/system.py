@@ -1,16 +1,17 @@
 """LiDAR-VAE: a variational autoencoder of distance and height in 40 rows without holes; seeds → range images."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core.configuration import COUNTS_SCANS, TypedSettings
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.configuration import COUNTS_SCANS, Settings
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative, Weight
 from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, SystemFacts
@@ -32,7 +33,7 @@ from lidargrit.systems.lidargan.networks import (
     IMAGE_CHANNELS,
     Decoder,
     Encoder,
-    check_initial_std,
+    InitialStd,
     kl_nats,
     vae_loss,
     without_counters,
@@ -42,7 +43,7 @@ _BYTES_AT_MOST = 1 << 29  # the largest published network takes 120 MB
 
 
 @dataclass(frozen=True)
-class LidarVaeConfig:
+class LidarVaeConfig(Settings):
     """Networks and objective of the VAE; the defaults are the published ones.
 
     Args:
@@ -57,23 +58,17 @@ class LidarVaeConfig:
         initial_std: standard deviation of the new weights of both networks.
     """
 
-    latent_dim: int = 128
-    channels: int = 64
+    latent_dim: Count = 128
+    channels: Count = 64
     rows: int = 40
     first_row: int = 17
-    warmup_scans: int = field(default=0, metadata={COUNTS_SCANS: True})
-    free_nats: float = 5.0
-    initial_std: float = 0.02
-
-    def __post_init__(self) -> None:
-        for name, least in (("latent_dim", 1), ("channels", 1), ("warmup_scans", 0), ("free_nats", 0)):
-            if not least <= getattr(self, name) < math.inf:
-                raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}, and finite", "correct it")
-        check_initial_std(self.initial_std)
+    warmup_scans: NotNegative = field(default=0, metadata={COUNTS_SCANS: True})
+    free_nats: Weight = 5.0
+    initial_std: InitialStd = 0.02
 
 
 @dataclass(frozen=True)
-class VaeSampling(TypedSettings):
+class VaeSampling(Settings):
     """Settings of completing and inverting scans; sampling itself has none.
 
     Args:
@@ -83,18 +78,9 @@ class VaeSampling(TypedSettings):
         search_rate: highest learning rate of that optimiser.
     """
 
-    spread: float = 1.0
-    search_steps: int = 300
-    search_rate: float = 0.05
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.search_steps > SEARCH_STEPS_AT_MOST:
-            got = f"search_steps={self.search_steps}"
-            raise ConfigError(got, f"at most {SEARCH_STEPS_AT_MOST:,}", "lower it")
-        for name, least in (("spread", 0), ("search_steps", 1), ("search_rate", 0)):
-            if not least <= getattr(self, name) < math.inf:
-                raise ConfigError(f"{name}={getattr(self, name)}", f"at least {least}, and finite", "correct it")
+    spread: Weight = 1.0
+    search_steps: Annotated[int, Bounds(1, SEARCH_STEPS_AT_MOST)] = 300
+    search_rate: Weight = 0.05
 
 
 class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
@@ -111,6 +97,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     Config = LidarVaeConfig
     Sampling = VaeSampling
     not_of_sampling = frozenset({"spread", "search_steps", "search_rate"})
+    trains = (("autoencoder", "image", "encode", "decode"),)
     facts = SystemFacts(
         generates="range; every ray of 40 rows returns, and no ray of the others",
         paper="Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019",
@@ -142,11 +129,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         """Rows that are generated."""
         return self.image.range
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("autoencoder",)
-
     def fit_statistics(self, images: RangeImages) -> None:
         """Take the scale of the images from the training scans."""
         self.image.fit(images)
@@ -154,13 +136,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     def objective(self, stage: str) -> Objective:
         """Return the objective of both networks."""
         return LidarVaeObjective(self.encode, self.decode, self.image, self.config)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained networks and the scale of their images."""
-        assert isinstance(objective, LidarVaeObjective)
-        self.image.load_state_dict(objective.image.state_dict())
-        self.encode.load_state_dict(objective.encode.state_dict())
-        self.decode.load_state_dict(objective.decode.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: VaeSampling) -> RangeImage:
         return self.image.decode(self.decode(self._latents(seeds)))

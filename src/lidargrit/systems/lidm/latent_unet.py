@@ -6,13 +6,16 @@ Parameter names follow the reference's state dict, so that published weights loa
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.nn.blocks import Block, Network, zeroed
 from lidargrit.nn.convolution import Convolution, wrapped
 
@@ -21,7 +24,7 @@ _BLOCKS_AT_MOST = 100  # residual blocks of a level; the published network has 2
 
 
 @dataclass(frozen=True)
-class LatentUnetConfig:
+class LatentUnetConfig(Settings):
     """Sizes of the network; the defaults are the published ones.
 
     Args:
@@ -37,32 +40,27 @@ class LatentUnetConfig:
             network of such groups cannot see whether latents are too high or too low as a whole.
     """
 
-    channels: int = 256
-    channel_multipliers: tuple[int, ...] = (1, 2, 4)
-    residual_blocks: int = 2
-    attention_levels: tuple[int, ...] = (0, 1, 2)
-    head_channels: int = 32
-    norm_groups: int = 32
+    channels: Annotated[int, Bounds(2, multiple_of=2)] = 256
+    channel_multipliers: Annotated[tuple[Count, ...], Bounds(1, 16)] = (1, 2, 4)
+    residual_blocks: Annotated[int, Bounds(1, _BLOCKS_AT_MOST)] = 2
+    attention_levels: tuple[NotNegative, ...] = (0, 1, 2)
+    head_channels: Count = 32
+    norm_groups: Count = 32
 
     def __post_init__(self) -> None:
-        if self.norm_groups < 1 or self.channels < 2 or self.channels % 2 or self.channels % self.norm_groups:
+        super().__post_init__()
+        if self.channels % self.norm_groups:
             raise ConfigError(
                 f"channels={self.channels} in norm_groups={self.norm_groups}",
-                "a positive even number of channels, a multiple of the groups",
+                "a number of channels that is a multiple of the groups",
                 "change one of them",
             )
         multipliers = self.channel_multipliers
-        if not 1 <= len(multipliers) <= 16 or min(multipliers) < 1 or not 1 <= self.residual_blocks <= _BLOCKS_AT_MOST:
-            raise ConfigError(
-                f"channel_multipliers={multipliers}, residual_blocks={self.residual_blocks}",
-                f"1 to 16 positive multipliers, and 1 to {_BLOCKS_AT_MOST} blocks",
-                "correct them",
-            )
         with_heads = {*self.attention_levels, len(multipliers) - 1}
-        if not all(0 <= level < len(multipliers) for level in with_heads):
+        if max(with_heads) >= len(multipliers):
             got = f"attention_levels={self.attention_levels}"
             raise ConfigError(got, f"numbers from 0 to {len(multipliers) - 1}", "leave the others out")
-        if self.head_channels < 1 or any(self.channels * multipliers[of] % self.head_channels for of in with_heads):
+        if any(self.channels * multipliers[of] % self.head_channels for of in with_heads):
             got = f"head_channels={self.head_channels}"
             raise ConfigError(got, "a divisor of the channels of every level with attention", "e.g. head_channels=16")
 

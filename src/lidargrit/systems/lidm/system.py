@@ -4,13 +4,15 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.typed_values import Bounds, Share
 from lidargrit.generation.encoding_cache import EncodingCache
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -35,7 +37,7 @@ _NOT_READ = (f"{_FIRST_STAGE}loss.*", f"{_AVERAGE}decay", f"{_AVERAGE}num_update
 
 
 @dataclass(frozen=True)
-class LidmConfig:
+class LidmConfig(Settings):
     """The two networks; the defaults are the published ones.
 
     Args:
@@ -54,7 +56,7 @@ class LidmConfig:
 
 
 @dataclass(frozen=True)
-class LidmSampling(TypedSettings):
+class LidmSampling(Settings):
     """Settings of sampling latents and returns.
 
     Args:
@@ -64,16 +66,9 @@ class LidmSampling(TypedSettings):
             each return, ``threshold`` keeps one that is at least as likely as not. LiDM's tokenizer gives none.
     """
 
-    steps: int = 50
-    eta: float = 1.0
+    steps: Annotated[int, Bounds(1, latent_diffusion.STEPS_AT_MOST)] = 50
+    eta: Share = 1.0
     mask: MaskDecoding = "bernoulli"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1 <= self.steps <= latent_diffusion.STEPS_AT_MOST:
-            raise ConfigError(f"steps={self.steps}", f"1 to {latent_diffusion.STEPS_AT_MOST}", "50 are published")
-        if not 0 <= self.eta <= 1:
-            raise ConfigError(f"eta={self.eta}", "a share from 0 to 1", "1 is published")
 
 
 class Lidm(Generator[LidmConfig, LidmSampling]):

@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.configuration import Settings
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.typed_values import Bounds
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -22,18 +24,14 @@ _BATCH = 16
 
 
 @dataclass(frozen=True)
-class MarginalConfig:
+class MarginalConfig(Settings):
     """Resolution of the histograms of range.
 
     Args:
         bins: number of bins of a logarithmic axis between the sensor's limits; with 128, each is 4 % wide.
     """
 
-    bins: int = 128
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.bins <= 4096:
-            raise ConfigError(f"{self.bins} bins", "1 to 4096", "choose about a hundred")
+    bins: Annotated[int, Bounds(1, 4096)] = 128
 
 
 @runtime_checkable

@@ -3,20 +3,24 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Int
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
-from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import STEPS_AT_MOST, is_temperature
+from lidargrit.core.typed_values import Bounds, Temperature, Weight
+from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
-from lidargrit.generation.tokens import PixelChoice, TokenGenerator, TokenGeneratorConfig, TokenObjective
+from lidargrit.generation.tokens import (
+    DecodingOfTokens,
+    TokenGenerator,
+    TokenGeneratorConfig,
+    TokenObjective,
+)
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.random import gumbel_of, rngs_of, sample_index
 from lidargrit.nn.transformer import MaskedTransformer
@@ -29,7 +33,7 @@ _NOT_ASKED = -100  # in the place of tokens that are shown, for torch's cross en
 
 
 @dataclass(frozen=True)
-class MaskedSampling(TypedSettings):
+class MaskedSampling(DecodingOfTokens):
     """Settings of sampling tokens, returns and ranges.
 
     Args:
@@ -39,44 +43,14 @@ class MaskedSampling(TypedSettings):
         order_temperature: scale of the Gumbel noise in the choice of the tokens that a pass keeps. It is added to the
             logarithm of a token's probability and falls to 0 with the last pass; 0 keeps the likeliest tokens, and the
             larger it is, the more random the order. The default is that of the authors' program.
-        mask: method by which returns and ranges are decided. ``pixels`` samples both by the pixel decoder, phase by
-            phase. ``bernoulli`` samples each return with its probability, independently of the others, and keeps the
-            decoded ranges. ``threshold`` keeps a return that is at least as likely as not. ``auto`` is ``pixels`` where
-            there is a pixel decoder, and ``bernoulli`` elsewhere.
-        range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
-            the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``).
-        range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
-        mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
-            sampled at once; 0 samples them independently.
         weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
             training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
-        decoder: number type of the tokenizer's decoder and of the pixel decoder, with the same choices.
     """
 
-    steps: int = 16
-    temperature: float = 1.0
-    order_temperature: float = 4.5
-    mask: PixelChoice = "auto"
-    range_temperature: float = PixelSampling.range_temperature
-    range_noise: float = PixelSampling.range_noise
-    mask_correlation: float = PixelSampling.mask_correlation
+    steps: Annotated[int, Bounds(1, STEPS_AT_MOST)] = 16
+    temperature: Temperature = 1.0
+    order_temperature: Weight = 4.5
     weights: Precision = "fp32"
-    decoder: Precision = "fp32"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.pixels()
-        valid = is_temperature(self.temperature) and self.order_temperature >= 0
-        if not (valid and 1 <= self.steps <= STEPS_AT_MOST):
-            raise ConfigError(
-                f"steps={self.steps}, temperature={self.temperature}, order_temperature={self.order_temperature}",
-                f"1 to {STEPS_AT_MOST:,} steps, temperature 0 or at least 1e-6, order_temperature at least 0",
-                "correct the one that is out of bounds",
-            )
-
-    def pixels(self) -> PixelSampling:
-        """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
 
 
 @dataclass(frozen=True)

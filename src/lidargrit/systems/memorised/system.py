@@ -3,12 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.errors import CheckpointError
+from lidargrit.core.typed_values import Bounds
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -19,18 +22,14 @@ from lidargrit.scans.types import RangeImage
 
 
 @dataclass(frozen=True)
-class MemorisedConfig:
+class MemorisedConfig(Settings):
     """Number of training scans that are kept.
 
     Args:
         scans: largest number of training scans that are kept, evenly spaced; 64x1024 pixels take 0.26 MB each.
     """
 
-    scans: int = 1000
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.scans <= 100_000:
-            raise ConfigError(f"{self.scans} scans", "1 to 100,000", "choose about a thousand")
+    scans: Annotated[int, Bounds(1, 100_000)] = 1000
 
 
 class Memorised(Generator[MemorisedConfig, NoSampling]):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -18,7 +19,7 @@ from lidargrit.scans.types import RangeImage
 
 
 @dataclass(frozen=True)
-class MultiscaleConfig:
+class MultiscaleConfig(Settings):
     """The networks of the pixel decoder, which is the whole system.
 
     Args:
@@ -38,6 +39,7 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
     """
 
     Config = MultiscaleConfig
+    trains = (("pixels", "pixels"),)
     facts = SystemFacts(generates="range and raydrop, each pixel given all pixels of coarser phases")
     Sampling = PixelSampling
     capabilities = frozenset({"complete", "likelihood"})
@@ -51,18 +53,9 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
         """Return networks of eight channels and one block."""
         return MultiscaleConfig(PixelDecoderConfig(mask_width=8, range_width=8, blocks=1))
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The pixel decoder alone."""
-        return ("pixels",)
-
     def objective(self, stage: str) -> Objective:
         """Return the negative log-likelihood of the pixels."""
         return PixelObjective(self.pixels) if stage == "pixels" else super().objective(stage)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.pixels.load_state_dict(objective.get_submodule(stage).state_dict())
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
         rngs = rngs_of(seeds)

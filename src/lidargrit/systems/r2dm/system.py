@@ -4,15 +4,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 from lidargrit.core.determinism import evenly_spaced, scan_seed
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, NotNegative
 from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, SystemFacts
@@ -38,7 +39,7 @@ _CALIBRATION_SEED = 1 << 40  # mixed with a scan's number, so that its seed is n
 
 
 @dataclass(frozen=True)
-class R2dmConfig:
+class R2dmConfig(Settings):
     """Channels and network of R2DM.
 
     Args:
@@ -51,15 +52,11 @@ class R2dmConfig:
 
     unet: UnetConfig = field(default_factory=UnetConfig)
     reflectance: bool = True
-    calibration_scans: int = 16
-
-    def __post_init__(self) -> None:
-        if self.calibration_scans < 0:
-            raise ConfigError(f"calibration_scans={self.calibration_scans}", "0 or more", "raise it")
+    calibration_scans: NotNegative = 16
 
 
 @dataclass(frozen=True)
-class DiffusionSampling(TypedSettings):
+class DiffusionSampling(Settings):
     """Settings of sampling, and the rule by which a pixel is a return.
 
     Args:
@@ -71,16 +68,10 @@ class DiffusionSampling(TypedSettings):
         resamples: number of times that each step is taken when a scan is completed.
     """
 
-    steps: int = 256
+    steps: Annotated[int, Bounds(1, STEPS_AT_MOST)] = 256
     sampler: Sampler = "ddpm"
     raydrop: Literal["published", "calibrated"] = "published"
-    resamples: int = 16
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1 <= min(self.steps, self.resamples) <= max(self.steps, self.resamples) <= STEPS_AT_MOST:
-            got = f"steps={self.steps}, resamples={self.resamples}"
-            raise ConfigError(got, f"1 to {STEPS_AT_MOST:,} of both", "256 and 16 are the default")
+    resamples: Annotated[int, Bounds(1, STEPS_AT_MOST)] = 16
 
 
 _CALIBRATION = DiffusionSampling(steps=32)
@@ -95,6 +86,7 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
     """
 
     Config = R2dmConfig
+    trains = (("diffusion", "network"),)
     facts = SystemFacts(
         generates="range and reflectance; a range outside the sensor's limits is no return",
         paper="Nakashima and Kurazume, LiDAR Data Synthesis with Denoising Diffusion Probabilistic Models, ICRA 2024",
@@ -131,11 +123,6 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         """Return 32 steps with 16 resamples each, as in the authors' demonstration."""
         return DiffusionSampling(steps=32)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """One stage."""
-        return ("diffusion",)
-
     def fit_statistics(self, images: RangeImages) -> None:
         """Count how many of the training scans' rays return."""
         chosen = evenly_spaced(_SHARE_SCANS, len(images))
@@ -148,11 +135,6 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
     def objective(self, stage: str) -> Objective:
         """Return the denoising of the network."""
         return Denoising(self.network, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network."""
-        assert isinstance(objective, Denoising)
-        self.network.load_state_dict(objective.network.state_dict())
 
     def after_training(self) -> None:
         """Fit the threshold of the calibrated raydrop: as many values lie above it as rays returned in training."""

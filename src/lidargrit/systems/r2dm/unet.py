@@ -6,13 +6,16 @@ Parameter names follow the reference's state dict, so that published weights loa
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.nn.blocks import Block, Network, zeroed
 from lidargrit.nn.convolution import Convolution
 
@@ -23,7 +26,7 @@ _BLOCKS_AT_MOST = 1000  # over all levels; the published network has 12
 
 
 @dataclass(frozen=True)
-class UnetConfig:
+class UnetConfig(Settings):
     """Sizes of the network; the defaults are the published ones.
 
     Args:
@@ -35,28 +38,26 @@ class UnetConfig:
         attention_heads: number of attention heads of the coarsest level, on both ways.
     """
 
-    channels: int = 64
-    channel_multipliers: tuple[int, ...] = (1, 2, 4, 8)
-    residual_blocks: tuple[int, ...] = (3, 3, 3, 3)
-    norm_groups: int = 8
-    attention_heads: int = 8
+    channels: Annotated[int, Bounds(4, multiple_of=2)] = 64
+    channel_multipliers: tuple[Count, ...] = (1, 2, 4, 8)
+    residual_blocks: tuple[Count, ...] = (3, 3, 3, 3)
+    norm_groups: Count = 8
+    attention_heads: Count = 8
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if sum(self.residual_blocks) > _BLOCKS_AT_MOST:
             raise ConfigError(f"residual_blocks={self.residual_blocks}", f"{_BLOCKS_AT_MOST} at most", "lower them")
-        numbers = (self.channels, *self.channel_multipliers, *self.residual_blocks, self.norm_groups)
-        if min(*numbers, self.attention_heads) < 1 or len(self.channel_multipliers) != len(self.residual_blocks):
+        if len(self.channel_multipliers) != len(self.residual_blocks):
             raise ConfigError(
-                f"channels={self.channels}, channel_multipliers={self.channel_multipliers}, "
-                f"residual_blocks={self.residual_blocks}, norm_groups={self.norm_groups}, "
-                f"attention_heads={self.attention_heads}",
-                "positive numbers, as many residual_blocks as channel_multipliers",
+                f"channel_multipliers={self.channel_multipliers}, residual_blocks={self.residual_blocks}",
+                "as many residual_blocks as channel_multipliers",
                 "correct them",
             )
-        if self.channels < 4 or self.channels % 2 or self.channels % self.norm_groups or self._has_split_heads():
+        if self.channels % self.norm_groups or self._has_split_heads():
             raise ConfigError(
                 f"channels={self.channels} with {self.norm_groups} norm_groups, {self.attention_heads} attention_heads",
-                "an even multiple of both, at least 4",
+                "a multiple of both",
                 "change one of them",
             )
 

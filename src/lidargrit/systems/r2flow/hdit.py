@@ -5,13 +5,16 @@ Parameter names follow the reference's state dict, so that published weights loa
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.nn.blocks import Block, Network
 from lidargrit.systems.r2flow.neighbourhood import neighbourhood_attention
 
@@ -22,7 +25,7 @@ _BLOCKS_AT_MOST = 1000  # over all levels; the published network has 21 on both 
 
 
 @dataclass(frozen=True)
-class HditConfig:
+class HditConfig(Settings):
     """Sizes of the network; the defaults are the published ones.
 
     Args:
@@ -33,22 +36,19 @@ class HditConfig:
         heads: number of attention heads in each level.
     """
 
-    channels: int = 128
-    time_channels: int = 256
-    depths: tuple[int, ...] = (3, 3, 3, 3)
-    heads: tuple[int, ...] = (2, 4, 8, 16)
+    channels: Annotated[int, Bounds(4)] = 128
+    time_channels: Annotated[int, Bounds(2, multiple_of=2)] = 256
+    depths: Annotated[tuple[Count, ...], Bounds(2)] = (3, 3, 3, 3)
+    heads: tuple[Count, ...] = (2, 4, 8, 16)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if sum(self.depths) > _BLOCKS_AT_MOST:
             raise ConfigError(f"depths={self.depths}", f"{_BLOCKS_AT_MOST} blocks at most", "lower them")
-        if len(self.depths) < 2 or len(self.depths) != len(self.heads) or min(*self.depths, *self.heads) < 1:
-            raise ConfigError(
-                f"depths={self.depths}, heads={self.heads}", "positive numbers, one of each a level", "correct them"
-            )
-        if self.time_channels < 2 or self.time_channels % 2:
-            raise ConfigError(f"time_channels={self.time_channels}", "an even number", "change it")
+        if len(self.depths) != len(self.heads):
+            raise ConfigError(f"depths={self.depths}, heads={self.heads}", "one of each a level", "correct them")
         each = zip(self.widths(), self.heads, strict=True)
-        if self.channels < 4 or any(width % (4 * heads) for width, heads in each):
+        if any(width % (4 * heads) for width, heads in each):
             raise ConfigError(
                 f"channels={self.channels}, heads={self.heads}",
                 "in every level a multiple of 4 channels for each head",

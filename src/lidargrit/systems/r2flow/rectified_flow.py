@@ -3,15 +3,16 @@
 import copy
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core.configuration import TypedSettings
+from lidargrit.core.configuration import Settings
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.objective import Objective
@@ -33,7 +34,7 @@ _HUBER_SCALE = 0.00054  # times the root of the number of an image's values, as 
 
 
 @dataclass(frozen=True)
-class FlowSampling(TypedSettings):
+class FlowSampling(Settings):
     """Settings of following the flow from noise to a scan.
 
     Args:
@@ -45,15 +46,11 @@ class FlowSampling(TypedSettings):
     """
 
     solver: Literal["euler", "dopri5"] = "euler"
-    steps: int = 0
-    tolerance: float = 1e-5
+    steps: Annotated[int, Bounds(0, STEPS_AT_MOST)] = 0
+    tolerance: Annotated[float, Bounds(1e-7, 1)] = 1e-5  # below, 32 bits of the network are the larger error
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.steps <= STEPS_AT_MOST:
-            raise ConfigError(f"steps={self.steps}", f"0 to {STEPS_AT_MOST:,}", "256 are published")
-        if not 1e-7 <= self.tolerance <= 1:  # below, 32 bits of the network are the larger error
-            raise ConfigError(f"tolerance={self.tolerance:g}", "a number from 1e-7 to 1", "change it")
         if self.solver == "euler" and self.tolerance != FlowSampling.tolerance:
             got = f"tolerance={self.tolerance:g} for solver=euler, which takes equal steps"
             raise ConfigError(got, "settings that have an effect", "leave it out, or add solver=dopri5")
@@ -63,7 +60,7 @@ class FlowSampling(TypedSettings):
 
 
 @dataclass(frozen=True)
-class ReflowConfig:
+class ReflowConfig(Settings):
     """The second training, and perhaps a third, on pairs of noise and the scan to which the flow so far leads from it.
 
     The second (2-RF) straightens the flow, the third (k-TD) distils it to a few equal steps of time.
@@ -76,18 +73,10 @@ class ReflowConfig:
         solving: settings by which the flow so far is followed to make the pairs; the adaptive solver is published.
     """
 
-    pairs: int = 1_000_000
-    distilled_steps: int = 0
-    distilled_pairs: int = 100_000
+    pairs: Count = 1_000_000
+    distilled_steps: Annotated[int, Bounds(0, _STEPS)] = 0
+    distilled_pairs: Count = 100_000
     solving: FlowSampling = field(default_factory=lambda: FlowSampling(solver="dopri5"))
-
-    def __post_init__(self) -> None:
-        if min(self.pairs, self.distilled_pairs) < 1:
-            raise ConfigError(
-                f"pairs={self.pairs}, distilled_pairs={self.distilled_pairs}", "at least 1 of each", "raise them"
-            )
-        if not 0 <= self.distilled_steps <= _STEPS:
-            raise ConfigError(f"distilled_steps={self.distilled_steps}", f"0 to {_STEPS}", "1, 2 and 4 are published")
 
 
 def steps_of(sampling: FlowSampling, distilled_steps: int = 0) -> int:

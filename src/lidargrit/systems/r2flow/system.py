@@ -6,6 +6,7 @@ from pathlib import Path
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
@@ -33,7 +34,7 @@ _COST_SEED = 0
 
 
 @dataclass(frozen=True)
-class R2flowConfig:
+class R2flowConfig(Settings):
     """Channels, network and trainings of R2Flow.
 
     Args:
@@ -59,6 +60,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
     """
 
     Config = R2flowConfig
+    trains = (("flow", "network"), ("reflow", "network"), ("distillation", "network"))
     facts = SystemFacts(
         generates="range and reflectance; a range outside the sensor's limits is no return",
         paper="Nakashima et al., Fast LiDAR Data Generation with Rectified Flows, ICRA 2025",
@@ -99,11 +101,6 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
             return FlowMatching(self.network, self.sensor)
         pairs, steps = (reflow.pairs, 0) if stage == "reflow" else (reflow.distilled_pairs, reflow.distilled_steps)
         return PairMatching(self.network, self.sensor, pairs, reflow.solving, steps)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained network."""
-        assert isinstance(objective, FlowMatching | PairMatching)
-        self.network.load_state_dict(objective.network.state_dict())
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: FlowSampling) -> RangeImage:
         return decode(self._solved(seeds, sampling).images, self.sensor)

@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Count
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import ClassMaps, class_indices
@@ -25,7 +27,7 @@ _CLASS_CHANNELS = 4  # learned, of the label of a surface
 
 
 @dataclass(frozen=True)
-class RaydropNetworkConfig:
+class RaydropNetworkConfig(Settings):
     """Sizes of the network of raydrop, and what it learns from.
 
     Args:
@@ -45,23 +47,22 @@ class RaydropNetworkConfig:
     """
 
     surfaces: Literal["known", "estimated"] = "known"
-    widths: tuple[int, int, int] = (32, 48, 64)
-    blocks: int = 2
-    features: int = 24
-    mask_width: int = 24
-    row_channels: int = 2
+    widths: tuple[Count, Count, Count] = (32, 48, 64)
+    blocks: Count = 2
+    features: Count = 24
+    mask_width: Count = 24
+    row_channels: Count = 2
     labels: bool = False
     reflectance: bool = False
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.labels and self.surfaces == "estimated":
             raise ConfigError(
                 "labels=true with surfaces=estimated, which has no label where nothing returned",
                 "surfaces that are known, or no labels",
                 "leave one of both out",
             )
-        if min(*self.widths, self.blocks, self.features, self.mask_width, self.row_channels) < 1:
-            raise ConfigError(f"{self}", "sizes of at least 1", "raise the one that is lower")
 
 
 class Returns(NamedTuple):

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
@@ -19,7 +20,7 @@ from lidargrit.systems.raydrop.objective import RaydropObjective
 
 
 @dataclass(frozen=True)
-class RaydropConfig:
+class RaydropConfig(Settings):
     """The network, which is the whole system.
 
     Args:
@@ -36,6 +37,7 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
     """
 
     Config = RaydropConfig
+    trains = (("raydrop", "raydrop"),)
     facts = SystemFacts(
         generates="raydrop of clean scans; reflectance of what returns if model.raydrop.reflectance is set",
         first_command="raydrop SCANS dropped --model RUN",
@@ -57,18 +59,9 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
         """Ranges of surfaces, and pixels among them whose returns are known."""
         return frozenset({"surfaces"})
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The network alone."""
-        return ("raydrop",)
-
     def objective(self, stage: str) -> Objective:
         """Return the likelihood of which surfaces return."""
         return RaydropObjective(self.raydrop, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.raydrop.load_state_dict(objective.get_submodule(stage).state_dict())
 
     @property
     def takes(self) -> frozenset[type[Condition]]:

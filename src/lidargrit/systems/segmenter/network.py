@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import NUM_CLASSES, labels_of
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
@@ -19,7 +21,7 @@ _HEIGHTS_AT_MOST = 4.0  # times that
 
 
 @dataclass(frozen=True)
-class SegmenterNetworkConfig:
+class SegmenterNetworkConfig(Settings):
     """Sizes of the segmenter's network, and what it sees.
 
     Args:
@@ -30,16 +32,17 @@ class SegmenterNetworkConfig:
         reflectance: whether the network sees the reflectance of returns, where scans have it.
     """
 
-    widths: tuple[int, int, int] = (32, 64, 96)
-    blocks: int = 2
-    attention_layers: int = 1
-    heads: int = 4
+    widths: tuple[Count, Count, Count] = (32, 64, 96)
+    blocks: Count = 2
+    attention_layers: NotNegative = 1
+    heads: Count = 4
     reflectance: bool = True
 
     def __post_init__(self) -> None:
-        if min(*self.widths, self.blocks, self.heads) < 1 or not 0 <= self.attention_layers <= self.blocks:
-            got = f"{self}"
-            raise ConfigError(got, "sizes of at least 1, and at most a layer of attention a block", "change one")
+        super().__post_init__()
+        if self.attention_layers > self.blocks:
+            got = f"attention_layers={self.attention_layers}, blocks={self.blocks}"
+            raise ConfigError(got, "at most a layer of attention a block", "change one")
 
 
 class SegmenterNetwork(nn.Module):

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import torch
 
+from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -17,7 +18,7 @@ from lidargrit.systems.segmenter.objective import SegmenterObjective
 
 
 @dataclass(frozen=True)
-class SegmenterConfig:
+class SegmenterConfig(Settings):
     """The network, which is the whole system.
 
     Args:
@@ -31,6 +32,7 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
     """A network that tells of every return which of the 19 classes of SemanticKITTI's benchmark it is."""
 
     Config = SegmenterConfig
+    trains = (("segmenter", "segmenter"),)
     facts = SystemFacts(
         generates="a label for every return of a scan; no scans",
         first_command="segment SCANS labelled --model RUN",
@@ -51,18 +53,9 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
         """No condition at all: it has no scans to sample."""
         return frozenset()
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The network alone."""
-        return ("segmenter",)
-
     def objective(self, stage: str) -> Objective:
         """Return the errors of the classes."""
         return SegmenterObjective(self.segmenter, self.sensor)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.segmenter.load_state_dict(objective.get_submodule(stage).state_dict())
 
     @torch.no_grad()
     def segment(self, images: RangeImage) -> RangeImage:

@@ -7,13 +7,16 @@ Source:
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.nn.blocks import Block
 
 _BLOCKS_AT_MOST = 1000
@@ -22,7 +25,7 @@ _OTHER_REGION = -100.0  # added to the logits of tokens that are neighbours only
 
 
 @dataclass(frozen=True)
-class SwinConfig:
+class SwinConfig(Settings):
     """Sizes of a stack of blocks; the defaults are those of UltraLiDAR's encoder and decoder.
 
     Args:
@@ -31,17 +34,16 @@ class SwinConfig:
         blocks: number of blocks; the windows of every second block are shifted by half a window.
     """
 
-    width: int = 512
-    heads: int = 16
-    blocks: int = 12
+    width: Annotated[int, Bounds(4, multiple_of=4)] = 512
+    heads: Count = 16
+    blocks: Annotated[int, Bounds(1, _BLOCKS_AT_MOST)] = 12
 
     def __post_init__(self) -> None:
-        if not 1 <= self.blocks <= _BLOCKS_AT_MOST:
-            raise ConfigError(f"blocks={self.blocks}", f"1 to {_BLOCKS_AT_MOST}", "12 are published")
-        if self.heads < 1 or self.width < 4 or self.width % self.heads or self.width % 4:
+        super().__post_init__()
+        if self.width % self.heads:
             raise ConfigError(
                 f"heads={self.heads}, width={self.width}",
-                "positive numbers, the width a multiple of the heads and of 4",
+                "a width that is a multiple of the heads",
                 "change the width or the heads",
             )
 

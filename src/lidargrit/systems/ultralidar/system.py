@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lidargrit.core.errors import ConfigError
+from lidargrit.core.configuration import Settings
+from lidargrit.core.typed_values import Bounds
 from lidargrit.generation.batches import check_seeds
 from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.facts import Cost, SystemFacts
@@ -42,7 +44,7 @@ _ROUNDS_AT_MOST = 1000
 
 
 @dataclass(frozen=True)
-class UltraLidarConfig:
+class UltraLidarConfig(Settings):
     """Cells and networks; the defaults are the program's for KITTI-360, 158,317,312 parameters.
 
     Args:
@@ -69,13 +71,8 @@ class VoxelSampling(FillSampling):
             swapped, and whose points are lower corners.
     """
 
-    rounds: int = 8
+    rounds: Annotated[int, Bounds(0, _ROUNDS_AT_MOST)] = 8
     points: VoxelVariant = "exact"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 <= self.rounds <= _ROUNDS_AT_MOST:
-            raise ConfigError(f"rounds={self.rounds}", f"0 to {_ROUNDS_AT_MOST}", "8 are published")
 
 
 class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
@@ -90,6 +87,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
     """
 
     Config = UltraLidarConfig
+    trains = (("autoencoder", "autoencoder"), ("prior", "prior"))
     facts = SystemFacts(
         generates="occupied voxels; as range images, the first on each ray, with no return where a ray meets none",
         paper="Xiong et al., UltraLiDAR: Learning Compact Representations for LiDAR Completion and Generation, "
@@ -119,20 +117,11 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         """Return 4 passes and one round."""
         return VoxelSampling(steps=4, rounds=1)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The autoencoder of voxels, then the transformer over its tokens."""
-        return ("autoencoder", "prior")
-
     def objective(self, stage: str) -> Objective:
         """Return the reconstruction of voxels, or the likelihood of hidden tokens over the frozen autoencoder."""
         if stage == "autoencoder":
             return VoxelReconstruction(self.autoencoder, self.sensor, self.config.flips)
         return HiddenVoxelTokens(self.autoencoder, self.prior, self.sensor, self.config.flips)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over a stage's trained weights."""
-        self.get_submodule(stage).load_state_dict(objective.get_submodule(stage).state_dict())
 
     @torch.no_grad()
     def sample_voxels(self, seeds: Sequence[int], sampling: VoxelSampling | None = None) -> Bool[Tensor, "B z y x"]:

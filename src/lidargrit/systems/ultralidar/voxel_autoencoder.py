@@ -8,12 +8,15 @@ Source:
 """
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.quantiser import Quantised, VectorQuantiser
@@ -24,7 +27,7 @@ _EMPTY_AT_FIRST = -3.0  # bias of the logits of occupancy: before training a vox
 
 
 @dataclass(frozen=True)
-class VoxelAutoencoderConfig:
+class VoxelAutoencoderConfig(Settings):
     """Cells, tokens and networks of the first stage; the defaults are the program's for KITTI-360.
 
     Args:
@@ -36,17 +39,14 @@ class VoxelAutoencoderConfig:
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)
-    patch: int = 8
+    patch: Count = 8
     blocks: SwinConfig = field(default_factory=SwinConfig)
-    num_codes: int = 1024
-    code_dim: int = 1024
+    num_codes: Annotated[int, Bounds(2)] = 1024
+    code_dim: Count = 1024
 
     def __post_init__(self) -> None:
-        if self.num_codes < 2 or self.code_dim < 1:
-            raise ConfigError(
-                f"num_codes={self.num_codes}, code_dim={self.code_dim}", "2 codes or more", "1024 are published"
-            )
-        if self.patch < 1 or self.grid.cells[0] % self.patch or self.grid.cells[1] % self.patch:
+        super().__post_init__()
+        if self.grid.cells[0] % self.patch or self.grid.cells[1] % self.patch:
             raise ConfigError(
                 f"patch={self.patch} of {self.grid.cells[0]}x{self.grid.cells[1]} cells",
                 "a number that divides both",

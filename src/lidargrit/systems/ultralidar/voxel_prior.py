@@ -8,14 +8,15 @@ Source:
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from lidargrit.core.configuration import TypedSettings
-from lidargrit.core.errors import ConfigError
+from lidargrit.core.configuration import Settings
+from lidargrit.core.typed_values import Bounds, NotNegative, ShareBelow1, Weight
 from lidargrit.nn.blocks import Network
 from lidargrit.systems.ultralidar.swin import SwinConfig, initialise_linear, sine_cosine_positions, swin_blocks
 
@@ -29,7 +30,7 @@ Fill = Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]]
 
 
 @dataclass(frozen=True)
-class FillSampling(TypedSettings):
+class FillSampling(Settings):
     """Settings of filling hidden tokens in.
 
     Args:
@@ -42,23 +43,10 @@ class FillSampling(TypedSettings):
             scans come out empty: empty space is the surest token, and sure tokens are shown first.
     """
 
-    steps: int = 30
-    order_temperature: float = 2.0
-    blank_share: float = 20 / 1024
-    blank_steps: int = 10
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1 <= self.steps <= _STEPS_AT_MOST:
-            raise ConfigError(f"steps={self.steps}", f"1 to {_STEPS_AT_MOST}", "30 are published")
-        if not 0 <= self.order_temperature < math.inf:
-            raise ConfigError(f"order_temperature={self.order_temperature}", "0 or more", "2 is published")
-        if not 0 <= self.blank_share < 1 or self.blank_steps < 0:
-            raise ConfigError(
-                f"blank_share={self.blank_share}, blank_steps={self.blank_steps}",
-                "a share in [0, 1), and no negative number",
-                "correct the one that is out of bounds",
-            )
+    steps: Annotated[int, Bounds(1, _STEPS_AT_MOST)] = 30
+    order_temperature: Weight = 2.0
+    blank_share: ShareBelow1 = 20 / 1024
+    blank_steps: NotNegative = 10
 
 
 class VoxelPrior(Network):

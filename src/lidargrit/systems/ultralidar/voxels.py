@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Count, Positive
 from lidargrit.scans.projection.unproject import points_of_pixels
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -22,7 +24,7 @@ _CELLS_AT_MOST = 1 << 26  # four times the published grid; a float a cell is 268
 
 
 @dataclass(frozen=True)
-class VoxelGrid:
+class VoxelGrid(Settings):
     """A box of equal cells about the sensor; the defaults are UltraLiDAR's for KITTI-360.
 
     Args:
@@ -35,14 +37,11 @@ class VoxelGrid:
     """
 
     low_m: tuple[float, float, float] = (-50.0, -50.0, -3.73)
-    cell_m: tuple[float, float, float] = (0.15625, 0.15625, 0.15)
-    cells: tuple[int, int, int] = (640, 640, 40)
+    cell_m: tuple[Positive, Positive, Positive] = (0.15625, 0.15625, 0.15)
+    cells: tuple[Count, Count, Count] = (640, 640, 40)
 
     def __post_init__(self) -> None:
-        if not all(0 < side < math.inf for side in self.cell_m) or min(self.cells) < 1:
-            raise ConfigError(
-                f"cell_m={self.cell_m}, cells={self.cells}", "positive numbers", "correct the one that is not"
-            )
+        super().__post_init__()
         if math.prod(self.cells) > _CELLS_AT_MOST:
             raise ConfigError(f"cells={self.cells}", f"at most {_CELLS_AT_MOST:,} cells in all", "take larger cells")
         high = [low + side * count for low, side, count in zip(self.low_m, self.cell_m, self.cells, strict=True)]

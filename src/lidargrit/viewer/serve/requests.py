@@ -2,14 +2,14 @@
 
 import dataclasses
 import inspect
-import math
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 from lidargrit.core.discovery import names
 from lidargrit.core.errors import CheckpointError, ConfigError, nearest_names
+from lidargrit.core.typed_values import Bounds, Share, check, fits
 from lidargrit.core.untrusted import SEED_AT_MOST, parse_json
 from lidargrit.data import formats
 from lidargrit.viewer.serve.limits import Limits
@@ -151,32 +151,27 @@ def upload_endings() -> list[str]:
 
 def _about(sampling: type, name: str) -> str:
     """Return what a class's docstring says of a field, in one line."""
-    text = inspect.cleandoc(sampling.__doc__ or "")
+    text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in sampling.__mro__)
     found = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
     return " ".join(found[1].split()).replace("``", "") if found else ""
 
 
 def _whole(name: str, value: Any, at_least: int, at_most: int) -> int:
-    if type(value) is not int or not at_least <= value <= at_most:  # nor a bool, which is an int to Python
-        raise ConfigError(f"{name}={str(value)[:40]}", f"a whole number from {at_least} to {at_most}", "correct it")
+    check(Annotated[int, Bounds(at_least, at_most)], value, name)
     return value
 
 
 def _number(setting: SamplingSetting, value: Any) -> int | float:
     if setting.whole:
         return _whole(setting.name, value, 0, int(setting.at_most))
-    if type(value) not in (int, float) or not (abs(value) <= setting.at_most and math.isfinite(value)):
-        raise ConfigError(f"{setting.name}={str(value)[:40]}", f"a number up to {setting.at_most:g}", "correct it")
+    check(Annotated[float, Bounds(-setting.at_most, setting.at_most)], value, setting.name)
     return float(value)
 
 
 def _region(value: Any) -> tuple[float, ...]:
     numbers = value if isinstance(value, list) else [value]
     if numbers and not (
-        len(numbers) == 4
-        and all(type(number) in (int, float) and 0 <= number <= 1 for number in numbers)
-        and numbers[0] < numbers[2]
-        and numbers[1] < numbers[3]
+        fits(tuple[Share, Share, Share, Share], tuple(numbers)) and numbers[0] < numbers[2] and numbers[1] < numbers[3]
     ):
         wanted = "left, top, right and bottom as shares of the image"
         raise ConfigError(f"region={str(value)[:40]}", wanted, "draw it anew")
