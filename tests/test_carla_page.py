@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import lidargrit
+from lidargrit.scans.projection.unfolding import rings_from_firing_order
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "how-to" / "carla.md"
 CHANNELS, COLUMNS, UPPER_DEG, LOWER_DEG = 64, 1024, 2.0, -24.8
@@ -74,3 +75,13 @@ def test_files_that_carla_saves_are_read_with_y_to_the_left_and_said_so(name, tm
     other = lidargrit.load_scan(tmp_path / "other.ply")
     assert torch.allclose(other.points_xyz_m, torch.from_numpy(rows[:, :3].copy()), atol=1e-3)
     assert not any("left-handed" in note for note in other.notes)
+
+
+@pytest.mark.parametrize("dropped", [0, 1])
+def test_equally_long_rings_that_begin_behind_are_as_many_as_there_are(dropped):
+    """The seam ahead cuts each of 64 into two halves, which made 65 of them."""
+    points = np.frombuffer(measured(wall_right_m=5.0), np.float32).reshape(-1, 4)[dropped:, :3].T
+    ring = rings_from_firing_order(np.ascontiguousarray(points))
+    own = np.repeat(np.arange(CHANNELS), COLUMNS)[dropped:]
+    assert ring.max() + 1 == CHANNELS + dropped, "rings of other lengths are told by the seam alone"
+    assert (ring == own).all() == (dropped == 0)

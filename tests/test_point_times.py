@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import lidargrit
+from format_examples import written
 from lidargrit.data import formats
 from lidargrit.data.export import export_scans
 from lidargrit.scans.types import Scan
@@ -83,6 +84,21 @@ def test_files_keep_the_times(ending, start_s, tmp_path):
     again = formats.read_scan(file)
     assert again.point_time_s is not None
     np.testing.assert_allclose(again.point_time_s, start_s + SINCE_S, rtol=0, atol=5e-7)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_argoverse_tells_the_times_of_each_of_its_sensors(index, tmp_path):
+    feather = pytest.importorskip("pyarrow.feather")
+    path = written(formats.load("argoverse_feather"), tmp_path)
+    table = feather.read_table(path)
+    offset_ns = np.linspace(0, 1e8, len(table)).round().astype(np.int32)
+    laser = np.where(np.arange(len(table)) % 3 == 0, 32, 0) + table["laser_number"].to_numpy()
+    table = table.set_column(table.schema.get_field_index("offset_ns"), "offset_ns", [offset_ns])
+    table = table.set_column(table.schema.get_field_index("laser_number"), "laser_number", [laser.astype(np.uint8)])
+    feather.write_feather(table, str(path))
+    scan = formats.load("argoverse_feather").read(path, index)
+    assert scan.point_time_s is not None
+    np.testing.assert_allclose(scan.point_time_s, offset_ns[laser // 32 == index] / 1e9, atol=1e-12)
 
 
 def _scan(**column):

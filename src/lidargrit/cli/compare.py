@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     of = {name: f"(default: {value})" for name, value in DEFAULTS.items()}
     add("--reference", metavar="SCANS", help=f"real scans {of['reference']}")
     add("-n", "--count", type=whole_number, metavar="N", help=f"samples of each system, and scans {of['count']}")
-    protocol = f"of: lidargrit list protocols {of['protocol']}, or completion (of hidden parts)"
+    protocol = f"one of: lidargrit list protocols {of['protocol']}, or completion"
     add("--protocol", metavar="NAME", help=protocol)
     add("--metrics", nargs="+", metavar="NAME", help="others than the protocol's: lidargrit list metrics")
     add("--flops", type=float, metavar="N", help="training operations of each system (default: its own)")

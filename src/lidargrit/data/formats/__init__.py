@@ -30,6 +30,10 @@ _CURES = {  # by the ending, for files that hold scans but are not read
     (".zst", ".zstd"): "unpack it with: zstd -d",
     (".gz", ".bz2", ".xz", ".zip", ".7z"): "unpack it first",
     (".bag.active",): "finish it with: rosbag reindex",
+    (
+        ".h5",
+        ".hdf5",
+    ): "name its datasets in Python: lidargrit.Scan.from_points(file['points'][:], file['intensity'][:])",
     (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
 }
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all

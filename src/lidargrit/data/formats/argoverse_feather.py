@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.scans.point_times import point_times
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 
@@ -73,7 +74,7 @@ class ArgoverseFeather(ScanFormat):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan of the upright sensor (0) or of the one upside down (1)."""
         name = _NAMES[index]
-        columns = _columns(path, _COLUMNS, read_bytes(path, _FILE_BYTES_AT_MOST, _FORMAT))
+        columns = _columns(path, _COLUMNS, read_bytes(path, _FILE_BYTES_AT_MOST, _FORMAT), may_have=("offset_ns",))
         laser = columns["laser_number"].astype(np.int64) - _LASERS * index
         own = (laser >= 0) & (laser < _LASERS)
         if not own.any():
@@ -82,12 +83,15 @@ class ArgoverseFeather(ScanFormat):
         axes, origin_m = _pose(path, name)
         xyz_m = (car_m - origin_m) @ axes
         xyz_m[~car_m.any(axis=1)] = 0  # a placeholder for no return stays one
+        fired = {name: values[own] for name, values in columns.items() if name == "offset_ns"}
+        times_s, _ = point_times(fired, torch.ones(int(own.sum()), dtype=torch.bool))
         return scan_of(
             torch.from_numpy(xyz_m.astype(np.float32)),
             torch.from_numpy(columns["intensity"][own].astype(np.float32) / 255),
             torch.from_numpy(_rings(xyz_m, laser[own], turned_over=index == 1)),
             str(path),
             bad_points,
+            point_time_s=times_s,
         )
 
     @staticmethod
@@ -181,8 +185,8 @@ def _up(pose: Any) -> Float64[np.ndarray, "3"]:
     return Rotation.from_quat(pose[:4]).as_matrix()[:, 2]
 
 
-def _columns(path: Path, wanted: tuple[str, ...], data: bytes) -> dict[str, np.ndarray]:
-    """Unpack some columns of a feather file, or raise ScanError."""
+def _columns(path: Path, wanted: tuple[str, ...], data: bytes, may_have: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+    """Unpack some columns of a feather file, and others where it has them, or raise ScanError."""
     try:
         import pyarrow as pa  # noqa: PLC0415  an optional part
         from pyarrow import ipc  # noqa: PLC0415
@@ -195,6 +199,7 @@ def _columns(path: Path, wanted: tuple[str, ...], data: bytes) -> dict[str, np.n
         schema = ipc.open_stream(body).schema
         if missing := [name for name in wanted if schema.get_all_field_indices(name) == []]:
             raise ValueError(f"no column {', '.join(missing)}")
+        wanted += tuple(name for name in may_have if schema.get_all_field_indices(name))
         for name in wanted:
             kind = schema.field(name).type
             if not (pa.types.is_string(kind) if name == "sensor_name" else _is_number(pa, kind)):

@@ -11,7 +11,8 @@ def rings_from_firing_order(xyz_m: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarr
     """Number the rings of points that are stored ring by ring, each counter-clockwise from straight ahead.
 
     A ring begins where the azimuth, counted from 0 to 2 pi, falls by more than pi. A stray point beyond the seam, which
-    would count as a ring of its own and shift every row, joins its neighbour.
+    would count as a ring of its own and shift every row, joins its neighbour. Rings that are all equally long and begin
+    elsewhere, as CARLA's behind, are counted by their length.
 
     Returns:
         ring of every point, 0 = the first (on KITTI the highest).
@@ -23,7 +24,18 @@ def rings_from_firing_order(xyz_m: Float32[np.ndarray, "3 n"]) -> Int32[np.ndarr
     lengths = np.diff(np.concatenate(([0], starts, [xyz_m.shape[1]])))
     true_ring = lengths >= max(1.0, _STRAY_SHARE * float(np.median(lengths)))
     number = np.maximum(np.cumsum(true_ring) - 1, 0).astype(np.int32)
+    rings = int(number[-1])  # one fewer, where files begin their rings elsewhere: the seam cuts each into two
+    if rings > 1 and xyz_m.shape[1] % rings == 0 and _turn_once(azimuths_rad(xyz_m).reshape(rings, -1)):
+        return np.repeat(np.arange(rings, dtype=np.int32), xyz_m.shape[1] // rings)
     return np.repeat(number, lengths)
+
+
+def _turn_once(azimuth_rad: Float64[np.ndarray, "H W"]) -> bool:
+    """Return whether each of so many equally long rings turns counter-clockwise, once, and from the same place."""
+    steps_rad = np.diff(azimuth_rad, axis=1) % (2 * np.pi)
+    turns = steps_rad.sum(1)
+    begins = np.abs(np.angle(np.exp(1j * (azimuth_rad[:, 0] - azimuth_rad[0, 0]))))
+    return bool((steps_rad > 0).all() and (turns < 2 * np.pi).all() and begins.max() <= steps_rad.max())
 
 
 def reference_rings(xyz_m: Float32[np.ndarray, "3 n"], height: int) -> Int32[np.ndarray, "n"]:
