@@ -39,8 +39,8 @@ _VEHICLE = [number for number, of_class in CLASSES.items() if of_class.learned i
 def blurred(images: RangeImage, columns: int = 3) -> RangeImage:
     """Give each return the mean range of the returns among neighbouring columns."""
     shifts = range(-(columns // 2), columns // 2 + 1)
-    total = sum(images.range_m.roll(shift, -1) for shift in shifts)
-    count = sum(images.return_mask.roll(shift, -1).float() for shift in shifts)
+    total = torch.stack([images.range_m.roll(shift, -1) for shift in shifts]).sum(0)
+    count = torch.stack([images.return_mask.roll(shift, -1) for shift in shifts]).sum(0)
     range_m = torch.where(images.return_mask, total / count.clamp(min=1), 0)
     return RangeImage.masked(range_m, images.return_mask, images.sensor, images.planes)
 
@@ -48,8 +48,8 @@ def blurred(images: RangeImage, columns: int = 3) -> RangeImage:
 def without_vehicles(images: RangeImage, every: int = 2) -> RangeImage:
     """Drop the returns of every second vehicle, or of every n-th."""
     gone, number = torch.zeros_like(images.return_mask), 0
-    for index, image in enumerate(images):
-        for pixels in vehicles_of(image):
+    for index in range(len(images)):
+        for pixels in vehicles_of(images[index]):
             number += 1
             if number % every == 0:
                 gone[index][pixels] = True
@@ -61,8 +61,8 @@ def boxes_for_vehicles(images: RangeImage) -> RangeImage:
     ones = torch.ones_like(images.return_mask[0])
     rays = points_of_pixels(RangeImage(ones.float(), ones, images.sensor)).double().numpy()
     made = []
-    for image in images:
-        range_m, label, gone = image.range_m.clone(), image.label.clone(), torch.zeros_like(ones)
+    for image in (images[index] for index in range(len(images))):
+        range_m, label, gone = image.range_m.clone(), image.planes["label"].clone(), torch.zeros_like(ones)
         points = points_of_pixels(image).double().numpy()
         for pixels in vehicles_of(image):
             entry_m = torch.from_numpy(_entry_into_box(rays, points[pixels.numpy()]))
@@ -85,7 +85,7 @@ DAMAGES: dict[str, Callable[[RangeImage], RangeImage]] = {
 
 def vehicles_of(image: RangeImage) -> list[torch.Tensor]:
     """Return the pixels of each vehicle of a labelled image: connected ones, at least six."""
-    found, count = ndimage.label(np.isin(image.label.numpy(), _VEHICLE) & image.return_mask.numpy(), np.ones((3, 3)))
+    found, count = ndimage.label(np.isin(image.planes["label"].numpy(), _VEHICLE) & image.return_mask.numpy(), np.ones((3, 3)))
     masks = [torch.from_numpy(found == number) for number in range(1, count + 1)]
     return [mask for mask in masks if int(mask.sum()) >= 6]
 
@@ -109,10 +109,9 @@ def _streets(folder: Path, block: int) -> RangeImage:
         first = _FIRST_SEED + block * _BLOCK
         images = [project(simulate(seed, SENSOR), SENSOR) for seed in range(first, first + _BLOCK)]
         folder.mkdir(parents=True, exist_ok=True)
+        parts = {"range_m": [image.range_m for image in images], "label": [image.planes["label"] for image in images]}
         with atomic_path(path) as partial, partial.open("wb") as file:
-            np.savez(
-                file, range_m=torch.stack([i.range_m for i in images]), label=torch.stack([i.label for i in images])
-            )
+            np.savez(file, **{name: torch.stack(maps).numpy() for name, maps in parts.items()})
     kept = {name: torch.from_numpy(values) for name, values in np.load(path).items()}
     return RangeImage.masked(kept["range_m"], kept["range_m"] > 0, SENSOR, {"label": kept["label"]})
 

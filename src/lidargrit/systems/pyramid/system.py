@@ -72,6 +72,7 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
     facts = SystemFacts(generates="range and raydrop, nearest ranges first, from coarse to fine")
     Sampling = PixelSampling
     capabilities = frozenset({"likelihood"})
+    trains = (("levels", "levels"),)
 
     def __init__(self, config: PyramidConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -93,18 +94,9 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
         pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=8, range_width=8, blocks=1)
         return PyramidConfig(3, pixels, 8, 8, 8, 1, 8)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """All levels at once."""
-        return ("levels",)
-
     def objective(self, stage: str) -> Objective:
         """Return the negative log-likelihood of all levels."""
         return PyramidObjective(self.levels, self.sensor) if stage == "levels" else super().objective(stage)
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over the trained weights."""
-        self.levels.load_state_dict(objective.get_submodule(stage).state_dict())
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
         rngs, images, told = rngs_of(seeds), None, None
