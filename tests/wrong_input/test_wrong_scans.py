@@ -56,9 +56,9 @@ def test_bad_points_are_dropped_by_the_setting_that_the_message_names(refused, r
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / "000001.bin").write_bytes(changed(rows, damage))
     words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]", f"data.val=[{tmp_path / 'scans'}]"]
-    setting = re.search(r"--set (data\.bad_points=\w+)", refused(*words))
-    assert setting
-    assert main([*words, setting[1]]) == 0, "the same folder can be used: nothing had begun"
+    setting = re.findall(r"--bad-points|(?<=--bad-points )\w+", refused(*words))
+    assert len(setting) == 2
+    assert main([*words, *setting]) == 0, "the same folder can be used: nothing had begun"
     assert (tmp_path / "run" / "model.safetensors").exists()
 
 
@@ -68,15 +68,15 @@ def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, r
     for index, name in enumerate(("not at all", damage, "not at all")):
         (tmp_path / "scans" / f"{index:06d}.bin").write_bytes(changed(rows, name))
     words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]"]
-    setting = re.search(r"--set (data\.bad_scans=\w+)", refused(*words))
-    assert setting
-    assert main([*words, setting[1]]) == 0
+    setting = re.findall(r"--bad-scans|(?<=--bad-scans )\w+", refused(*words))
+    assert len(setting) == 2
+    assert main([*words, *setting]) == 0
     output = capsys.readouterr().err
     assert output.count("left out: got ") == 1
     assert "000001.bin" in output
     (tmp_path / "scans" / "000000.bin").unlink()
     (tmp_path / "scans" / "000002.bin").unlink()
-    assert "no usable scan in" in refused(*train_words(tmp_path / "none"), *words[-1:], setting[1])
+    assert "no usable scan in" in refused(*train_words(tmp_path / "none"), *words[-1:], *setting)
 
 
 REAL_DAMAGE = {
