@@ -85,7 +85,9 @@ DAMAGES: dict[str, Callable[[RangeImage], RangeImage]] = {
 
 def vehicles_of(image: RangeImage) -> list[torch.Tensor]:
     """Return the pixels of each vehicle of a labelled image: connected ones, at least six."""
-    found, count = ndimage.label(np.isin(image.planes["label"].numpy(), _VEHICLE) & image.return_mask.numpy(), np.ones((3, 3)))
+    found, count = ndimage.label(
+        np.isin(image.planes["label"].numpy(), _VEHICLE) & image.return_mask.numpy(), np.ones((3, 3))
+    )
     masks = [torch.from_numpy(found == number) for number in range(1, count + 1)]
     return [mask for mask in masks if int(mask.sum()) >= 6]
 
@@ -109,9 +111,9 @@ def _streets(folder: Path, block: int) -> RangeImage:
         first = _FIRST_SEED + block * _BLOCK
         images = [project(simulate(seed, SENSOR), SENSOR) for seed in range(first, first + _BLOCK)]
         folder.mkdir(parents=True, exist_ok=True)
-        parts = {"range_m": [image.range_m for image in images], "label": [image.planes["label"] for image in images]}
+        whole = RangeImage.stack(images)
         with atomic_path(path) as partial, partial.open("wb") as file:
-            np.savez(file, **{name: torch.stack(maps).numpy() for name, maps in parts.items()})
+            np.savez(file, range_m=whole.range_m.numpy(), label=whole.planes["label"].numpy())
     kept = {name: torch.from_numpy(values) for name, values in np.load(path).items()}
     return RangeImage.masked(kept["range_m"], kept["range_m"] > 0, SENSOR, {"label": kept["label"]})
 

@@ -107,7 +107,7 @@ def _is_a(kind: type, value: Any) -> bool:
 def check(hint: Any, value: Any, name: str) -> None:
     """Refuse a value that does not fit its type, with one line that tells its name and what would fit."""
     if not fits(hint, value):
-        raise _misfit(hint, value, name)
+        raise _misfit(hint, repr(value), name)
 
 
 def from_word(hint: Any, word: str, name: str) -> Any:
@@ -129,8 +129,7 @@ def bare(hint: Any) -> Any:
     return hint
 
 
-def _misfit(hint: Any, value: Any, name: str) -> ConfigError:
-    text = str(value)
+def _misfit(hint: Any, text: str, name: str) -> ConfigError:
     shown = text if len(text) <= _SHOWN_AT_MOST else f"{text[:_SHOWN_AT_MOST]} [...]"
     return ConfigError(f"{name}={shown}", in_words(hint), "correct the value")
 
