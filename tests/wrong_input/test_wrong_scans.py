@@ -184,15 +184,15 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         (["train", "lidargrit_demo", "OUT", "--set", "seed=-1"], r"seed=-1; wanted"),
         (
             ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.betas=[2.0,3.0]"],
-            r"betas=\(2\.0, 3\.0\); wanted",
+            r"betas=\[2\.0,3\.0\]; wanted 2 values, each a number",
         ),
         (
             ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.weight_decay=-1"],
-            r"weight_decay=-1\.0; wanted",
+            r"weight_decay=-1; wanted",
         ),
         (
             ["train", "lidargrit_demo", "OUT", "--set", "model.transformer.residual_dropout=2"],
-            r"residual_dropout=2\.0; wanted",
+            r"residual_dropout=2; wanted",
         ),
         (
             ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"],
@@ -200,8 +200,8 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
         ),
         (["sample", "RUN", "OUT", "-n", "0"], r"-n 0; wanted at least one scan"),
         (["sample", "RUN", "OUT", "--seed", "-1"], r"--seed -1; wanted"),
-        (["sample", "RUN", "OUT", "--set", "sampling.top_p=0"], r"top_p=0\.0; wanted"),
-        (["sample", "RUN", "OUT", "--set", "sampling.temperature=.nan"], r"temperature=nan; wanted a finite number"),
+        (["sample", "RUN", "OUT", "--set", "sampling.top_p=0"], r"top_p=0; wanted"),
+        (["sample", "RUN", "OUT", "--set", "sampling.temperature=nan"], r"temperature=nan; wanted a number, at least"),
         (
             ["sample", "RUN", "OUT", "--set", "sampling.temprature=1"],
             r"'temprature', which sampling with 'lidargrit' does not have; wanted one such as temperature; .*list gen",
