@@ -135,7 +135,7 @@ def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path,
 def test_a_model_completes_in_several_ways_and_into_any_format(folders, tmp_path):
     out = tmp_path / "out"
     words = ["complete", f"{folders}/scans", str(out), "--model", f"{folders}/run", "--observed", "sector:90,270"]
-    assert main([*words, "-n", "2", "--format", "ply", "--device", "cpu"]) == 0
+    assert main([*words, "--samples", "2", "--format", "ply", "--device", "cpu"]) == 0
     ways = [points_of(out / f"completion_{way}/drive/1.ply", Ply) for way in (0, 1)]
     own = points_of(folders / "scans/drive/1.npz")
     behind = {point for point in own if point[0] < -0.5}

@@ -206,7 +206,7 @@ def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, mo
         path.rename(folder / f"{name}{path.suffix}")
     good = (folder / "ply.ply").read_bytes()
     (folder / "bad.ply").write_bytes(good[: len(good) // 2])
-    with pytest.raises(ScanError, match=r"bad\.ply.*data\.bad_scans=skip"):
+    with pytest.raises(ScanError, match=r"bad\.ply.*--bad-scans skip"):
         load_range_images([str(folder)], DataConfig())
     images = load_range_images([str(folder)], DataConfig(bad_scans="skip"))
     assert len(images) == 5

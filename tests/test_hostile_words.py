@@ -15,12 +15,12 @@ ASCII = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
 
 
 def python(words: list[str | bytes], folder: Path, environment: dict[str, str]) -> tuple[int, str]:
-    """Run Python in a folder; return its exit code and stderr, in ASCII as some terminals need it."""
+    """Run Python in a folder; return its exit code and stderr."""
     environment = {**os.environ, **environment}
     done = subprocess.run(
         [sys.executable, *words], cwd=folder, env=environment, capture_output=True, timeout=120, check=False
     )
-    return done.returncode, done.stderr.decode("ascii")
+    return done.returncode, done.stderr.decode("utf-8")
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
+from lidargrit.systems.r2flow.rectified_flow import ReflowConfig
 from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.log import Log, read_log
@@ -278,8 +279,9 @@ def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(
         with pytest.raises(ConfigError, match=message):
             train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path)
         assert not [*tmp_path.iterdir()]
+    preset = load_preset("r2flow_small")
     with pytest.raises(ConfigError, match=r"without training\.reflow"):
-        train(load_preset("r2flow_small", ["model.reflow={}"]), tmp_path)
+        train(replace(preset, model=replace(preset.model, reflow=ReflowConfig())), tmp_path)
 
 
 def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):

@@ -45,17 +45,9 @@ def said(*scores, **more):
     return verdict(scores, 200, **more).sentences
 
 
-@pytest.fixture
-def as_measured():
-    """Read the package's table."""
-
-
 @pytest.fixture(autouse=True)
-def every_metric_sees_objects(monkeypatch, request):
-    if "as_measured" not in request.fixturenames:
-        monkeypatch.setattr(
-            sight, "blind_to", lambda metric, variant, scans: () if metric != "coverage" else ("boxes",)
-        )
+def every_metric_sees_objects(monkeypatch):
+    monkeypatch.setattr(sight, "blind_to", lambda metric, variant, scans: () if metric != "coverage" else ("boxes",))
 
 
 def test_a_metric_that_would_not_have_seen_damaged_objects_is_not_within_noise():
@@ -95,8 +87,8 @@ def test_a_damage_that_was_seen_with_fewer_scans_is_seen_with_more(monkeypatch):
     sight._measured.cache_clear()
 
 
-@pytest.mark.usefixtures("as_measured")
-def test_every_measured_metric_has_every_damage_and_is_one_of_the_program():
+def test_every_measured_metric_has_every_damage_and_is_one_of_the_program(monkeypatch):
+    monkeypatch.undo()
     measured = sight._measured()
     damages = {tuple(sorted(each)) for each in measured.values()}
     assert len(damages) == 1

@@ -34,7 +34,7 @@ def test_a_folder_with_foreign_files(refused, run_folder, tmp_path):
         (train_words(tmp_path / "thesis" / "chapter.tex"), "which is not empty and holds no run"),
         (train_words(tmp_path / "thesis" / "chapter.tex" / "x"), "wanted a folder that may be written to"),
         (["demo", "--out", tmp_path / "thesis"], "which is not empty and holds no run"),
-        (["sample", run_folder, tmp_path / "thesis"], "which is not empty and holds no samples; wanted an empty"),
+        (["sample", run_folder, tmp_path / "thesis"], "which is not empty and holds no samples.json; wanted an empty"),
         (["sample", run_folder, run_folder], "which is not empty and holds no samples"),
         (["sample", run_folder, tmp_path / "thesis" / "chapter.tex"], "which is not empty and holds no samples"),
     ):

@@ -148,6 +148,13 @@ def leaves(config: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def own_first(settings: Any) -> dict[str, Any]:
+    """Return settings by name, those of their own class before the ones that it shares with others."""
+    names = [field.name for field in dataclasses.fields(settings)]
+    names.sort(key=lambda name: name not in type(settings).__annotations__)
+    return {name: getattr(settings, name) for name in names}
+
+
 def _replaced(node: Any, prefix: str, values: dict[str, Any]) -> Any:
     """Change all settings below a node at once, for a setting may be valid only together with another."""
     changed: dict[str, Any] = {}

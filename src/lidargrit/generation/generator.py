@@ -330,7 +330,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @classmethod
     def about(cls) -> list[str]:
         """Return lines for a person: the system's facts, and the sampling settings with their defaults."""
-        return cls.facts.lines(cls.capabilities, configuration.leaves(cls.Sampling()), cls.not_of_sampling)
+        return cls.facts.lines(cls.capabilities, configuration.own_first(cls.Sampling()), cls.not_of_sampling)
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> "Generator[Any, Any]":

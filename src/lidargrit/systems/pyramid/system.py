@@ -84,8 +84,9 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
                 "lower levels, or choose another number of columns",
             )
         sensors = [sensor]
-        for _ in range(config.levels - 1):
-            sensors.append(halved_sensor(sensors[-1]))
+        with torch.device("cpu"):  # rays are numbers also where networks are built without values
+            for _ in range(config.levels - 1):
+                sensors.append(halved_sensor(sensors[-1]))
         self.levels = nn.ModuleList(_level(config, number, sensors) for number in range(config.levels))
 
     @classmethod

@@ -1,12 +1,12 @@
 """A client's JSON → a request whose every value is checked; and the numbers of a generator that a client may set."""
 
-import dataclasses
 import inspect
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
+from lidargrit.core.configuration import own_first
 from lidargrit.core.discovery import names
 from lidargrit.core.errors import CheckpointError, ConfigError, nearest_names
 from lidargrit.core.typed_values import Bounds, Share, check, fits
@@ -76,13 +76,13 @@ def sampling_settings(sampling: Any) -> list[SamplingSetting]:
     """Return the numbers among the fields of a generator's ``Sampling``."""
     hints = get_type_hints(type(sampling))
     found = []
-    for one in dataclasses.fields(sampling):
-        kind, default = hints[one.name], getattr(sampling, one.name)
+    for name, default in own_first(sampling).items():
+        kind = hints[name]
         if kind not in (int, float, int | None, float | None):
             continue
         whole = kind in (int, int | None)
         at_most = max(_WHOLE_AT_MOST if whole else _FRACTION_AT_MOST, default or 0)
-        found.append(SamplingSetting(one.name, whole, default, at_most, _about(type(sampling), one.name)))
+        found.append(SamplingSetting(name, whole, default, at_most, _about(type(sampling), name)))
     return found
 
 
