@@ -24,6 +24,7 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.nn.flops import flops_of
 from lidargrit.scans.example import Example
 from lidargrit.scans.marks import read_marks
+from lidargrit.systems.r2flow.rectified_flow import ReflowConfig
 from lidargrit.training import compute, computing_time, training_flops, with_budget
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.table_page import table_page
@@ -173,7 +174,8 @@ def test_a_budget_scales_all_stages_alike():
     assert short.model.warmup_scans == pytest.approx(vae.model.warmup_scans / 4, rel=0.01)
     with pytest.raises(ConfigError, match="at least one batch"):
         with_budget(preset, 1e6)
-    lacking = load_preset("r2flow_small", ["model.reflow={}"])
+    lacking = load_preset("r2flow_small")
+    lacking = replace(lacking, model=replace(lacking.model, reflow=ReflowConfig()))
     for count in (training_flops, lambda preset: with_budget(preset, 1e13)):
         with pytest.raises(ConfigError, match=r"without training\.reflow, a stage of model=r2flow"):
             count(lacking)

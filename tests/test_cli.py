@@ -285,7 +285,7 @@ def test_list_names_everything_there_is(typed):
         for name in discovery.names(kind):
             assert f"  {name} " in output
             assert f"  {name} " in in_full
-    assert "sample --set sampling.NAME: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0, mask=auto" in typed(
+    assert "sample --set sampling.NAME: temperature=1.0, top_k=0, top_p=1.0, guidance=0.0" in typed(
         "list", "generators"
     )
     assert "licence: " in typed("list", "datasets")

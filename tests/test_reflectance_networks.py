@@ -258,8 +258,9 @@ def test_complete_writes_it_and_its_error_is_told_where_both_have_it(folders, tm
     models = [f"{folders}/run", f"{folders}/plain", "triangulation"]
     settings = ["--protocol", "completion", "--reference", f"{folders}/scans", "--observed", "rows:4", "-n", "2"]
     assert main(["compare", str(tmp_path / "one"), *models, *settings, "--device", "cpu"]) == 0
-    head, run, plain, triangles = capsys.readouterr().out.splitlines()[-4:]
-    assert "reflectance MAE" in head
+    lines = capsys.readouterr().out.splitlines()
+    first = next(index for index, line in enumerate(lines) if "reflectance MAE" in line)
+    head, run, plain, triangles = lines[first : first + 4]
     column = slice(head.index("reflectance MAE") - 10, head.index("reflectance MAE") + 15)
     errors = [line[column].split() for line in (run, plain, triangles)]
     assert 0 < float(errors[2][0]) < float(errors[0][0]) + 0.05

@@ -61,8 +61,6 @@ def test_a_configuration_beside_small_weights_builds_no_large_network(tmp_path, 
     about["config"]["transformer"][name] = value
     (folder / "config.json").write_text(json.dumps(about))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(
-        CheckpointError, match=r"config\.json( with a network|, in which stands|.*layers=1000000; wanted)"
-    ):
+    with pytest.raises(CheckpointError, match=r"config\.json( with a network|.*layers=1000000; wanted)"):
         load(folder)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000, "kibibytes"
