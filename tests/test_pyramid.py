@@ -20,7 +20,7 @@ SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64, 1)
 
 def pyramid():
     torch.manual_seed(0)
-    return Pyramid(Pyramid.smallest_config(SENSOR), SENSOR)
+    return Pyramid(replace(Pyramid.smallest_config(SENSOR), levels=3), SENSOR)
 
 
 def some_images(count=2):

@@ -91,9 +91,9 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> PyramidConfig:
-        """Return three levels of eight channels and one block."""
+        """Return two levels of eight channels and one block."""
         pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=8, range_width=8, blocks=1)
-        return PyramidConfig(3, pixels, 8, 8, 8, 1, 8)
+        return PyramidConfig(2, pixels, 8, 8, 8, 1, 8)
 
     def objective(self, stage: str) -> Objective:
         """Return the negative log-likelihood of all levels."""
