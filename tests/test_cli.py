@@ -376,11 +376,12 @@ def test_the_version_is_told():
     assert done.stdout.strip() == f"lidargrit {lidargrit.__version__}"
 
 
-def test_a_reader_that_has_seen_enough_is_no_error():
+@pytest.mark.parametrize("words", [["list"], ["--print-completion", "bash"], []])
+def test_a_reader_that_has_seen_enough_is_no_error(words):
     reading, writing = os.pipe()
     os.close(reading)
     with contextlib.closing(os.fdopen(writing, "w")) as pipe:
-        command = [sys.executable, "-m", "lidargrit", "list"]
+        command = [sys.executable, "-m", "lidargrit", *words]
         done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
 

@@ -50,8 +50,8 @@ def _run(words: list[str]) -> int:
         print(f"lidargrit {verb}".rstrip() + f": {error}", file=sys.stderr)
         return 2
     if options.verb is None:
-        print(script(parser, options.print_completion) if options.print_completion else parser.format_help())
-        return 0
+        told = script(parser, options.print_completion) if options.print_completion else parser.format_help()
+        options.run = lambda _: print(told)
     try:
         with _refusing_unusable_paths(), reporting.to(reporting.TerminalReporter()):
             options.run(options)
