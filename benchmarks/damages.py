@@ -31,7 +31,6 @@ SENSOR = load_sensor("hdl64e_kitti_odometry")
 _FIRST_SEED = 2_000_000  # the simulator's first test street
 _BLOCK = 20  # streets whose features are computed together; sets are chosen from blocks
 _WAYS = 10  # of choosing both sets
-_SPREADS = 2.8
 _NOT_DAMAGED = ("reflectance_histogram",)
 _VEHICLE = [number for number, of_class in CLASSES.items() if of_class.learned in (10, 18, 20)]
 
@@ -85,10 +84,9 @@ DAMAGES: dict[str, Callable[[RangeImage], RangeImage]] = {
 
 def vehicles_of(image: RangeImage) -> list[torch.Tensor]:
     """Return the pixels of each vehicle of a labelled image: connected ones, at least six."""
-    found, count = ndimage.label(
-        np.isin(image.planes["label"].numpy(), _VEHICLE) & image.return_mask.numpy(), np.ones((3, 3))
-    )
-    masks = [torch.from_numpy(found == number) for number in range(1, count + 1)]
+    found = np.zeros(image.range_m.shape, np.int64)
+    ndimage.label(np.isin(image.planes["label"].numpy(), _VEHICLE) & image.return_mask.numpy(), np.ones((3, 3)), found)
+    masks = [torch.from_numpy(found == number) for number in range(1, int(found.max()) + 1)]
     return [mask for mask in masks if int(mask.sum()) >= 6]
 
 

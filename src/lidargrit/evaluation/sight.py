@@ -7,7 +7,7 @@ from importlib import resources
 from typing import Final
 
 DEVIATIONS: Final = 2.8
-"""Student's 97.5 % quantile for the ways of choosing scans: by so many standard deviations a damage is seen."""
+"""Standard deviations beyond which a difference is no chance: Student's 97.5 % quantile for five halvings."""
 
 _TABLE = "sight.csv"
 

@@ -32,7 +32,6 @@ PIXEL_STATISTICS, MEMORISED = "marginal", "memorised"
 ENOUGH = 100
 """Scans of each set: below, the interval itself rests on too little, and hardly any score differs from its bounds."""
 
-_SPREADS = 2.8  # Student's 97.5 % quantile for the five halvings of real against real
 _NOTHING_KNOWN = "No verdict: it takes intervals, and real against real or pixel statistics beside them."
 _WITHOUT_PIXELS = (
     "Pixel statistics, which any model has to beat, were not scored, so that no good score is counted (evaluate "
@@ -196,7 +195,7 @@ def tells_apart(score: Score) -> bool | None:
     real = score.real_against_real
     if score.pixel_statistics is None or real is None:
         return None
-    chance = noise(score) if real.spread is None else _SPREADS * real.spread
+    chance = noise(score) if real.spread is None else sight.DEVIATIONS * real.spread
     return _worse_by(score, score.pixel_statistics, real.value) > chance
 
 

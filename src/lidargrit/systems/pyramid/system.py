@@ -61,7 +61,7 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
 
     A pixel of a coarser level has the nearest range of 2x2 pixels of the finer one. So what is thin and near, such as
     a pole, stands at every level, and a finer level only decides which of four pixels it fills, where a mean or every
-    second pixel would lose it. Each level is a pixel decoder given the coarser level.
+    second pixel would lose it. Each level is a pixel decoder given all coarser levels.
 
     Source:
         Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017, for levels and phases; there each
@@ -100,11 +100,7 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
         return PyramidObjective(self.levels, self.sensor) if stage == "levels" else super().objective(stage)
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
-        rngs, images, told = rngs_of(seeds), None, None
-        for level in reversed(levels_of(self.levels)):
-            images, told = level.sample(images, told, rngs, self._finest(level, sampling))
-        assert images is not None
-        return images
+        return self._sampled([], rngs_of(seeds), sampling)
 
     @torch.no_grad()
     def resample(self, images: RangeImage, seeds: Sequence[int], levels: int = 2) -> RangeImage:
@@ -117,20 +113,24 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
         """
         every, made = levels_of(self.levels), []
         for index, seed in enumerate(seeds):
-            pyramid = images_of(every, images[[index]].to(self.device))[levels:]
-            rngs, told, coarser = [torch.Generator().manual_seed(seed)], None, None
-            for level, true in zip(reversed(every), [*reversed(pyramid), *[None] * levels], strict=True):
-                if true is not None:
-                    told, coarser = level.guided(coarser, told)[1], true
-                else:
-                    coarser, told = level.sample(coarser, told, rngs, self._finest(level, PixelSampling()))
-            assert coarser is not None
-            made.append(coarser)
+            true = images_of(every, images[[index]].to(self.device))[levels:]
+            made.append(self._sampled(true, [torch.Generator().manual_seed(seed)], PixelSampling()))
         return RangeImage.cat(made)
 
-    def _finest(self, level: Level, sampling: PixelSampling) -> PixelSampling | None:
-        """Return the settings for a level: those that are asked for are of the finest."""
-        return sampling if level.sensor is self.sensor else None
+    def _sampled(self, true: list[RangeImage], rngs: Sequence[torch.Generator], sampling: PixelSampling) -> RangeImage:
+        """Return scans sampled below the true images of coarse levels, the finest of them first, if there are any.
+
+        The settings are of the finest level; coarser ones follow their own distribution.
+        """
+        coarser, told = None, None
+        for number, level in reversed(list(enumerate(levels_of(self.levels)))):
+            known = number - len(self.levels) + len(true)
+            if known >= 0:
+                told, coarser = level.guided(coarser, told)[1], true[known]
+            else:
+                coarser, told = level.sample(coarser, told, rngs, None if number else sampling)
+        assert coarser is not None
+        return coarser
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         """Return the bits of mask and ranges given the coarser level, and those of all coarser levels as tokens."""
@@ -157,7 +157,7 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
 
 
 class PyramidObjective(Objective):
-    """Negative log-likelihood of every level, each given the true coarser level.
+    """Negative log-likelihood of every level, each given the true coarser levels.
 
     In training the three finest levels learn from a sixteenth, an eighth and half of each batch: coarser ones have
     fewer pixels to learn from.
