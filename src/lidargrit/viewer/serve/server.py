@@ -104,8 +104,11 @@ def open_server(
         def close_all() -> None:
             wasyncore.close_all(open_sockets, ignore_all=True)
 
-        def stop() -> None:  # by the thread that runs it
-            server.trigger.pull_trigger(close_all)  # pyright: ignore[reportAttributeAccessIssue]  a number in the stubs
+        def stop() -> None:
+            trigger: Any = server.trigger  # a number in the stubs
+            with trigger.lock:  # else a response that wakes the server now closes the pipe before it is written to
+                trigger.thunks.append(close_all)  # called by the thread that runs the server
+                trigger.pull_trigger()
 
         try:
             yield RunningServer(bound.getsockname()[1], queue, server.run, stop)
