@@ -105,7 +105,7 @@ def open_server(
             wasyncore.close_all(open_sockets, ignore_all=True)
 
         def stop() -> None:
-            trigger: Any = server.trigger  # a number in the stubs
+            trigger: Any = server.trigger  # pyright: ignore[reportAttributeAccessIssue]  the stubs know no trigger
             with trigger.lock:  # else a response that wakes the server now closes the pipe before it is written to
                 trigger.thunks.append(close_all)  # called by the thread that runs the server
                 trigger.pull_trigger()
