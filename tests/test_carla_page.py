@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import lidargrit
+from lidargrit.cli import main
 from lidargrit.scans.projection.unfolding import rings_from_firing_order
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "how-to" / "carla.md"
@@ -75,6 +76,60 @@ def test_files_that_carla_saves_are_read_with_y_to_the_left_and_said_so(name, tm
     other = lidargrit.load_scan(tmp_path / "other.ply")
     assert torch.allclose(other.points_xyz_m, torch.from_numpy(rows[:, :3].copy()), atol=1e-3)
     assert not any("left-handed" in note for note in other.notes)
+
+
+def rows_of_a_street():
+    rows = np.frombuffer(measured(wall_right_m=5.0), np.float32).reshape(-1, 4)[::7]
+    noise = np.random.default_rng(0).normal(1, 0.001, len(rows))  # along the ray; CARLA's intensity knows none of it
+    return (rows * np.c_[np.repeat(noise[:, None], 3, axis=1), np.ones(len(rows))]).astype(np.float32)
+
+
+def saved(path, rows):
+    if path.suffix == ".bin":
+        path.write_bytes(rows.tobytes())
+    elif path.stem == "semantic":
+        kinds = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("CosAngle", "<f4"), ("ObjIdx", "<u4"), ("ObjTag", "<u4")]
+        np.save(path, np.array([(*row, 1, 2) for row in rows.tolist()], kinds))
+    else:
+        np.save(path, rows)
+    return path
+
+
+@pytest.mark.parametrize("name", ["raw.npy", "raw.bin", "semantic.npy"])
+def test_what_carla_sends_is_read_with_y_to_the_left_however_it_is_saved(name, tmp_path):
+    rows = rows_of_a_street()
+    left = torch.from_numpy(rows[:, :3] * np.float32([1, -1, 1]))
+    scan = lidargrit.load_scan(saved(tmp_path / name, rows))
+    assert torch.equal(scan.points_xyz_m, left)
+    assert scan.notes[-1].startswith("files of CARLA, left-handed")
+    # Whoever mirrored the points before saving them has y to the left already.
+    before = lidargrit.load_scan(saved(tmp_path / name, rows * np.float32([1, -1, 1, 1])))
+    assert torch.equal(before.points_xyz_m, left)
+    assert before.notes == ()
+    if "semantic" not in name:
+        rows[:, 3] = np.random.default_rng(1).permutation(rows[:, 3])  # as bright, but of no range: another sensor
+        assert torch.equal(lidargrit.load_scan(saved(tmp_path / name, rows)).points_xyz_m[:, 1], left[:, 1].neg())
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".bin", ".ply"])
+def test_completed_scans_of_carla_keep_left_and_right(suffix, tmp_path):
+    rows = rows_of_a_street()
+    path = tmp_path / f"scan{suffix}"
+    if suffix == ".ply":
+        lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+        lines += [f"property float32 {axis}" for axis in "xyzI"]
+        path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
+    else:
+        saved(path, rows)
+    words = ["--sensor", "hdl64e_kitti_odometry", "--model", "nearest", "--projection", "spherical"]
+    assert main(["complete", str(path), str(tmp_path / "out"), *words]) == 0
+    done = lidargrit.load_scan(tmp_path / "out" / f"scan{suffix}")
+    own, added = done.points_xyz_m[~done.filled], done.points_xyz_m[done.filled]
+    assert torch.equal(own, torch.from_numpy(rows[:, :3] * np.float32([1, -1, 1])))
+    for points in (own, added):  # the wall on the right is near
+        across = points[:, :2].norm(dim=1)
+        ahead_right, ahead_left = (points[:, 1] * side > 0.8 * across for side in (-1, 1))
+        assert across[ahead_right].median() < 6 < across[ahead_left].median()
 
 
 @pytest.mark.parametrize("dropped", [0, 1])

@@ -9,6 +9,7 @@ import torch
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
 from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, wide_row, write_rows
+from lidargrit.data.formats.shared.carla import right_handed
 from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
 
@@ -57,7 +58,7 @@ class KittiBin(ScanFormat):
                 + "download it again: the file was cut short or is of another format",
             )
         rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4))
-        return scan_of(
+        scan = scan_of(
             rows[:, :3],
             rows[:, 3].contiguous(),
             None,
@@ -66,6 +67,7 @@ class KittiBin(ScanFormat):
             filled=read_marks(path, len(rows)),
             rows=rows_of(_COLUMNS, rows),
         )
+        return right_handed(scan)
 
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:

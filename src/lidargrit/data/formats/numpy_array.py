@@ -12,11 +12,8 @@ from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_arra
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, damaged, first_bytes, open_file, read_bytes
-from lidargrit.data.formats.shared.columns import (
-    BYTES_AT_MOST,
-    ColumnFormat,
-    scan_of_columns,
-)
+from lidargrit.data.formats.shared.carla import right_handed
+from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, ColumnFormat, scan_of_columns
 from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
 from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
@@ -77,7 +74,7 @@ class NumpyArray(ColumnFormat):
                     _archive_columns(archive, path),
                     [one.removesuffix(".npy") for one in archive.namelist()],
                 )
-        return scan_of_columns(columns, path, bad_points, names, are_named=bool(names))
+        return right_handed(scan_of_columns(columns, path, bad_points, names, are_named=bool(names)), columns)
 
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, read_bytes
+from lidargrit.data.formats.shared.carla import mirrored
 from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
@@ -82,7 +83,7 @@ class Ply(ColumnFormat):
                 raise
             raise _refused(first_words(error), path) from None
         scan = scan_of_columns(columns, path, bad_points)
-        return _right_handed(scan) if _OF_CARLA.search(data[: header.end]) else scan
+        return mirrored(scan) if _OF_CARLA.search(data[: header.end]) else scan
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -94,13 +95,6 @@ class Ply(ColumnFormat):
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
         with atomic_path(path) as temporary:
             temporary.write_bytes("\n".join(header).encode() + rows.tobytes())
-
-
-def _right_handed(scan: Scan) -> Scan:
-    """Return a scan of CARLA, whose y points to the right, with y to the left."""
-    points = scan.points_xyz_m * scan.points_xyz_m.new_tensor([1.0, -1.0, 1.0])
-    note = "files of CARLA, left-handed (y to the right), are read with y to the left"
-    return replace(scan, points_xyz_m=points, notes=(*scan.notes, note))
 
 
 def _little_endian(values: np.ndarray) -> np.ndarray:
