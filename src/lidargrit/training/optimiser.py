@@ -12,6 +12,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import Block
+from lidargrit.training.muon import Muon
 
 
 def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
@@ -40,7 +41,7 @@ def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.
             "a stage with a transformer",
             "leave the stage's optimiser out: adamw is the default",
         )
-    muon = torch.optim.Muon(
+    muon = Muon(
         matrices,
         lr=config.learning_rate,
         weight_decay=config.weight_decay,
