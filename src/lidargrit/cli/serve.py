@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--port", type=int, default=8000, help="port to listen at; 0 for any free one")
     parser.add_argument("--seconds", type=float, default=120.0, help="time limit of one request, in seconds")
     add_device(parser)
+    parser.set_defaults(waits=True)
 
 
 def run(options: argparse.Namespace) -> None:
