@@ -196,10 +196,10 @@ class PyramidObjective(Objective):
 
     def _estimate(self, levels: list[Level], pyramid: list[RangeImage], rng: torch.Generator) -> Tensor:
         chance = float(torch.rand((), generator=rng))
-        counts = [_learned_from(len(pyramid[0]), number, chance) for number in range(len(levels))]
-        first = counts.index(next(filter(None, counts)))
-        levels = levels[first:]
-        learned = [images[:count] for images, count in zip(pyramid[first:], counts[first:], strict=True)]
+        shares = (_SHARES[: len(levels) - 1] + (1.0,) * len(levels))[: len(levels)]
+        counts = [int(len(pyramid[0]) * share + chance) for share in shares]
+        learned = [images[:count] for images, count in zip(pyramid, counts, strict=True) if count]
+        levels = levels[len(levels) - len(learned) :]
         loss = pyramid[0].range_m.new_zeros(())
         for level, images, guide in zip(levels, learned, guides_of(levels, learned), strict=True):
             mask_nats, range_nats = level.pixels.estimate(guide, images, rng)
@@ -233,11 +233,6 @@ def guides_of(levels: list[Level], pyramid: list[RangeImage]) -> list[Decoded | 
         guide, told = level.guided(None if coarser is None else coarser[:count], None if told is None else told[:count])
         guides.append(guide)
     return guides[::-1]
-
-
-def _learned_from(scans: int, number: int, chance: float) -> int:
-    """Return of how many scans of a batch a level learns; a chance from 0 to 1 rounds it up or down."""
-    return int(scans * _SHARES[number] + chance) if number < len(_SHARES) else scans
 
 
 def _level(config: PyramidConfig, number: int, sensors: list[SensorModel]) -> Level:
