@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -19,6 +20,7 @@ from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
+from lidargrit.training.muon import Muon
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
 
 
@@ -68,7 +70,8 @@ def muon_step(optimiser, model, seed):
     optimiser.step()
 
 
-def test_muon_moves_the_matrices_of_blocks_and_adamw_all_else():
+def test_muon_moves_the_matrices_of_blocks_and_adamw_all_else(monkeypatch):
+    monkeypatch.setattr("lidargrit.training.muon.dtype_of", lambda _precision: torch.bfloat16)  # as torch always does
     ours, theirs = small_transformer(), small_transformer()
     matrices = [p for name, p in theirs.named_parameters() if name.startswith("blocks.") and p.ndim == 2]
     others = [p for name, p in theirs.named_parameters() if not (name.startswith("blocks.") and p.ndim == 2)]
@@ -105,10 +108,29 @@ def test_muon_takes_the_kernels_of_blocks_as_matrices_of_one_row_a_channel(layou
         if weight.ndim == 4:
             matrix = nn.Parameter(before[name].flatten(1).clone())
             matrix.grad = gradients[name].flatten(1)
-            torch.optim.Muon([matrix], lr=0.1, weight_decay=0.0, adjust_lr_fn="match_rms_adamw").step()
+            Muon([matrix], lr=0.1, weight_decay=0.0, adjust_lr_fn="match_rms_adamw").step()
             step = (matrix - before[name].flatten(1)).abs().max()
-            # Both compute in bfloat16, the columns in another order.
+            # Perhaps in bfloat16, and with the columns in another order.
             assert (weight.flatten(1) - matrix).abs().max() < 0.02 * step
+
+
+@pytest.mark.parametrize("shape", [(3, 7), (7, 3), (5, 5)])
+def test_a_step_of_muon_is_that_of_a_loop_over_singular_values(shape, monkeypatch):
+    monkeypatch.setattr("lidargrit.training.muon.dtype_of", lambda _precision: torch.float32)
+    rng = np.random.default_rng(0)
+    start, gradients = rng.normal(size=shape), rng.normal(size=(3, *shape))
+    weight, wanted, average = nn.Parameter(torch.tensor(start).float()), start.copy(), np.zeros(shape)
+    optimiser = Muon([weight], lr=0.1, weight_decay=0.3, adjust_lr_fn="match_rms_adamw")
+    for gradient in gradients:
+        weight.grad = torch.tensor(gradient).float()
+        optimiser.step()
+        average = 0.95 * average + 0.05 * gradient
+        left, values, right = np.linalg.svd(0.05 * gradient + 0.95 * average, full_matrices=False)
+        values /= np.linalg.norm(values)
+        for _ in range(5):  # the polynomial acts on each singular value by itself
+            values = 3.4445 * values - 4.7750 * values**3 + 2.0315 * values**5
+        wanted = wanted * (1 - 0.1 * 0.3) - 0.1 * 0.2 * math.sqrt(max(shape)) * (left * values) @ right
+    assert weight.detach().numpy() == pytest.approx(wanted, abs=1e-5)
 
 
 def test_muon_goes_on_from_its_checkpoint(tmp_path):

@@ -23,7 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Tell the time, then train."""
     from lidargrit.core import reporting
-    from lidargrit.training import check_folder, computing_time, plan_training, train
+    from lidargrit.training import check_folder, measure, plan_training, train
+    from lidargrit.training.compute import duration
     from lidargrit.training.fine_tuning import fine_tuning_preset
 
     reporting.message("looking at the scans")
@@ -32,7 +33,9 @@ def run(options: argparse.Namespace) -> None:
     plan = plan_training(preset)
     said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in plan.flops)
     reporting.message(f"scans seen: {said}; stop it at any time, the same command goes on")
-    reporting.message(computing_time(sum(plan.flops.values()), "fp32"))
+    reporting.message("timing some steps of each stage")
+    seconds = sum(stage.seconds for stage in measure(preset, plan.flops))
+    reporting.message(f"training takes about {duration(seconds)} at the speed of these steps, beside validation")
     if options.dry_run:
         print(plan.as_text())
         return

@@ -14,6 +14,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.nn.blocks import Block
+from lidargrit.training.muon import Muon
 
 
 def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
@@ -43,7 +44,7 @@ def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.
             "leave the stage's optimiser out: adamw is the default",
         )
     with _as_matrices(matrices):
-        muon = torch.optim.Muon(
+        muon = Muon(
             matrices,
             lr=config.learning_rate,
             weight_decay=config.weight_decay,
