@@ -42,8 +42,10 @@ def test_points_are_found_with_what_lies_beside_them(tmp_path, datasets):
     assert count_scans(path) == 1
     scan = read_scan(path)
     assert torch.equal(scan.points_xyz_m, POINTS)
+    assert scan.reflectance is not None
     assert torch.equal(scan.reflectance, torch.from_numpy(INTENSITY / np.float32(255)))
     if "lidar/xyz" not in datasets:
+        assert scan.ring is not None
         assert scan.ring.tolist() == RING.tolist()
 
 
