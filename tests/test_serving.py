@@ -80,7 +80,8 @@ GOOD = {"model": 0, "seed": 3, "count": 2, "sampling": {"temperature": 1, "top_k
         ({"count": 10**9}, "at least 1, at most 8"),
         ({"model": 3}, "at least 0, at most 2"),
         ({"model": -1}, "at least 0, at most 2"),
-        ({"task": ["ahead"]}, "returns, ahead, rows"),
+        ({"task": ["ahead"]}, "ahead, region, returns, rows"),
+        ({"example": "../street"}, "one of street, vlp16, clean"),
         ({"region": [0, 0, 1]}, "left, top, right and bottom"),
         ({"region": [0.5, 0, 0.5, 1]}, "draw it anew"),
         ({"region": [0, 0, 1, float("nan")]}, "as shares of the image"),
@@ -190,7 +191,8 @@ def choose_file(browser: Browser, path: Path) -> None:
 def opened(browser, served) -> Browser:
     browser.events.clear()
     browser.send("Page.navigate", url=served.url)
-    browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk !== null")
+    browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk?.busy === false")
+    browser.click("[data-part=remove]")  # the scan that the page begins with
     return browser
 
 
@@ -249,9 +251,8 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     fill(opened, "#model", "2")
     for name, value in QUICK.items():
         fill(opened, f"[name={name}]", str(value))
-    fill(opened, "#task", "ahead")
     choose_file(opened, scan_file)
-    opened.click("#complete")
+    opened.click("#tasks [value=ahead]")
     finish(opened)
     assert said(opened) == ""
     assert names(opened) == ["as uploaded", "what the model saw", "completed by tiny-r2dm, steps=3, resamples=2"]
@@ -263,16 +264,47 @@ def test_a_scan_that_is_uploaded_is_completed(opened, scan_file):
     assert counts[1] <= counts[2], "what was seen is kept"
     assert opened.run("document.querySelectorAll('section b').length") == 0, "names are no HTML"
     fill(opened, "#model", "0")
-    opened.click("#complete")
+    opened.click("#tasks [value=ahead]")
     finish(opened)
     assert names(opened)[-1] == "completed by tiny-lidargrit"
     assert len(names(opened)) == 4
     fill(opened, "#mode", "label")
     assert "building" in opened.run("document.querySelector('#legend').textContent")
     fill(opened, "#model", "1")
-    assert opened.run("document.querySelector('#complete').disabled")
+    assert opened.run("[...document.querySelectorAll('#tasks button, #examples button')].every((one) => one.hidden)")
     assert "can neither complete" in opened.run("document.querySelector('#ability').textContent")
     assert opened.troubles() == []
+
+
+def test_the_page_begins_with_a_scan_that_turns_until_somebody_takes_hold_of_it(browser, served):
+    browser.events.clear()
+    browser.send("Page.navigate", url=served.url)
+    browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk?.busy === false")
+    assert names(browser) == ["tiny-lidargrit"]
+    turned = browser.run("desk.page.camera.turn")
+    browser.wait(f"desk.page.camera.turn > {turned} + 0.01")
+    browser.press("Escape")
+    browser.settle()
+    stopped = browser.run("desk.page.camera.turn")
+    browser.settle()
+    assert browser.run("desk.page.camera.turn") == stopped
+
+
+@pytest.mark.parametrize(("example", "panes"), [("street", 3), ("vlp16", 2), ("clean", 2)])
+def test_an_example_is_one_click_away(example, panes, opened):
+    opened.click(f"[data-example={example}]")
+    finish(opened)
+    assert said(opened) == ""
+    assert len(names(opened)) == panes
+    assert names(opened)[0] == "example"
+    points = opened.run("desk.page.panes.map((pane) => pane.scan.returns)")
+    filled = opened.run("desk.page.panes.map((pane) => pane.scan.filled.reduce((sum, one) => sum + one, 0))")
+    assert filled[:-1] == [0] * (panes - 1), "what was measured"
+    if example == "clean":
+        assert points[1] < points[0]
+        assert filled[1] == 0
+    else:
+        assert 0 < filled[-1] < points[-1]
 
 
 def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opened):
@@ -284,9 +316,8 @@ def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opene
 
 
 def test_the_mouse_draws_the_region_that_is_filled_in(opened, scan_file):
-    fill(opened, "#task", "region")
     choose_file(opened, scan_file)
-    opened.click("#complete")
+    opened.click("#tasks [value=region]")
     finish(opened)
     assert names(opened) == ["as uploaded"]
     assert "Now drag over" in opened.run("document.querySelector('#status').textContent")
@@ -295,29 +326,28 @@ def test_the_mouse_draws_the_region_that_is_filled_in(opened, scan_file):
     assert opened.run("desk.region") == pytest.approx([0.25, 0.3, 0.5, 0.8], abs=0.02)
     drawn = opened.box(".region")
     assert drawn == pytest.approx((left + 0.25 * width, top + 0.3 * height, 0.25 * width, 0.5 * height), abs=4)
-    opened.click("#complete")
+    opened.click("#tasks [value=region]")
     finish(opened)
     assert said(opened) == ""
     assert names(opened)[-3:] == ["as uploaded", "what the model saw", "completed by tiny-lidargrit"]
-    fill(opened, "#task", "raydrop")
+    opened.click("#tasks [value=raydrop]")
     assert opened.run("document.querySelectorAll('.region:not([hidden])').length") == 0
-    opened.click("#complete")
     finish(opened)
     assert names(opened)[-1] == "raydrop by tiny-lidargrit"
     fill(opened, "#model", "2")
-    assert opened.run("document.querySelector('#task').value") == "returns", "r2dm drops nothing"
+    assert opened.run("document.querySelector('#tasks [value=raydrop]').hidden"), "r2dm drops nothing"
     assert opened.troubles() == []
 
 
 def test_a_bad_file_is_told_in_one_line(opened, tmp_path):
     for name, data, why in (
         ("cut.bin", bytes(17), "17 bytes in cut.bin"),
-        ("text.docx", b"hello", "cannot be read here by itself"),
+        ("README.md", b"hello", "'README.md', which is no LiDAR scan that this page reads"),
         ("large.bin", bytes(4_000_016), "at most 4,000,000"),
     ):
         (tmp_path / name).write_bytes(data)
         choose_file(opened, tmp_path / name)
-        opened.click("#complete")
+        opened.click("#tasks [value=ahead]")
         finish(opened)
         assert why in said(opened), name
         assert "/" not in said(opened).replace("/complete", ""), "no place on the server's disk"
@@ -344,7 +374,7 @@ def test_everything_is_reached_by_keys_and_has_a_name(opened):
         "SUMMARY",
         "generate",
         "file",
-        "complete",
+        "task",
         "mode",
         "npz",
         "remove",
