@@ -30,7 +30,7 @@ class Example(NamedTuple):
     """A simulated street to try a task on.
 
     Args:
-        words: what its button on the page says.
+        words: text of its button on the page.
         task: the task that its button asks for.
         sensor: name of the sensor that sees it; "" for that of the model.
         every_beam_returns: whether no beam is lost.
