@@ -231,7 +231,7 @@ def test_a_file_that_needs_another_beside_it_is_not_offered(served):
     words = urllib.parse.quote(json.dumps({"name": "drive.pcap", "model": 2}))
     status, why = served.refused(f"/complete?request={words}", b"x" * 100)
     assert status == 400
-    assert "cannot be read here by itself" in why
+    assert "which is no LiDAR scan that this page reads" in why
     assert ".ply" in why
     assert why.count(".pcap") == 1
 
