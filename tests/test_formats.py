@@ -54,7 +54,7 @@ def with_cell(row: int, column: int | slice, value: float) -> np.ndarray:
 
 def test_the_longest_ending_counts(tmp_path):
     assert [one.public_name() for one in candidates(tmp_path / "a.PCD.bin")] == ["nuscenes_bin"]
-    assert [one.public_name() for one in candidates(tmp_path / "a.b.bin")] == ["kitti_bin", "xyz_bin"]
+    assert [one.public_name() for one in candidates(tmp_path / "a.b.bin")] == ["kitti_bin", "nclt_bin", "xyz_bin"]
     assert [stem(tmp_path / name) for name in ("a.pcd.bin", "a.b.bin", "a.pcd", "a.b.txt")] == ["a", "a.b", "a", "a.b"]
     (tmp_path / "a.txt").write_text("no scan")
     with pytest.raises(ScanError, match=r"a\.txt, whose ending we do not know; wanted one of \.bag, \.bin, "):
