@@ -177,20 +177,6 @@ def test_arrays_by_name_by_column_and_organised(tmp_path):
         assert open_source(str(tmp_path / f"{name}.npz")).kind == "scans"
 
 
-@pytest.mark.parametrize(
-    ("arrays", "cure"),
-    [
-        ({"pc": ROWS["x"], "more": ROWS["y"]}, "call the array of points 'points'"),
-        ({"points": ROWS["x"]}, r"shape it into rows, such as array.view\(np.float32\).reshape\(-1, 4\)"),
-        ({"points": np.zeros((POINTS, 6))}, "keep x, y, z, intensity, ring of each point"),
-    ],
-)
-def test_other_arrays_are_refused_with_what_to_do(tmp_path, arrays, cure):
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(ScanError, match=cure):
-        read_scan(tmp_path / "a.npz")
-
-
 def test_a_fourth_column_of_rings_is_no_reflectance(tmp_path):
     np.save(tmp_path / "a.npy", np.c_[xyz_of(TABLE).numpy(), TABLE["ring"]].astype(np.float32))
     scan = check(tmp_path / "a.npy", with_reflectance=False)
