@@ -14,12 +14,11 @@ import torch
 from browser import Browser
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
-from lidargrit.data import formats
 from lidargrit.data.formats import read_scan
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.scans.types import RangeImage
 from lidargrit.viewer import interactive, scan_sets
 from lidargrit.viewer.interactive import page, write_page
 from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
@@ -389,57 +388,3 @@ def test_without_a_graphics_card_points_are_drawn_by_hand(opened, written, scrip
         for one in (by_card, by_hand)
     ]
     assert (blocks[0] == blocks[1]).mean() > 0.9, "the same points in the same places"
-
-
-@pytest.fixture(scope="module")
-def cloud(tmp_path_factory) -> Path:
-    """A completed cloud with points that share a pixel, and others that no row looks at."""
-    folder = tmp_path_factory.mktemp("cloud")
-    scan = unproject(scans(SENSOR.with_columns(2048, 8).fine(), 1)[0])
-    twins, above = scan.points_xyz_m[:700] * 1.01, scan.points_xyz_m[:50] * 1.0
-    above[:, 2] = above[:, :2].norm(dim=1)
-    points = torch.cat((scan.points_xyz_m, twins, above))
-    filled = torch.arange(len(points)) % 3 == 0
-    ring = torch.cat((scan.ring, scan.ring[:750]))
-    reflectance = torch.linspace(0, 1, len(points))
-    write_npz = next(one for one in formats.candidates(folder / "a.npz")).write
-    write_npz(folder / "a.npz", Scan(points, reflectance, ring, filled=filled))
-    return folder
-
-
-@pytest.mark.parametrize("options", [[], ["--set", "data.columns=256"]])
-def test_a_page_of_a_cloud_shows_every_point_or_counts_those_that_it_hides(cloud, options, tmp_path, capsys, browser):
-    out, scan = tmp_path / "v.html", read_scan(cloud / "a.npz")
-    words_of = ["view", str(cloud), "-o", str(out), "--projection", "spherical", "--sensor", "hdl64e_kitti_odometry"]
-    assert main([*words_of, *options]) == 0
-    (source,) = page_data(out.read_text(encoding="utf-8"))["sources"]
-    (one,), told = source["scans"], capsys.readouterr().err
-    in_pixels = int((unpacked(one["range"], "<u2") > 0).sum())
-    filled = unpacked(one["filled"], "u1")
-    browser.open(out)
-    about = words(browser, "about")[0]
-    if options:
-        assert (one["hidden"], "beside" in one) == (len(scan) - in_pixels, False)
-        assert f"{one['hidden']:,} of {len(scan):,} points are hidden, since each pixel of 64x256 shows one" in told
-        assert f"{one['hidden']:,} more are hidden" in about
-        assert filled.sum() < scan.filled.sum()
-        return
-    beside = unpacked(one["beside"], "<f4").reshape(-1, 3)
-    assert (len(beside), one["hidden"]) == (len(scan) - in_pixels, 0)
-    assert len(beside) >= 750
-    assert "hidden" not in told + about
-    measured = len(scan) - int(scan.filled.sum())
-    assert f": {len(scan):,} points, from " in about
-    assert (
-        f"; {measured:,} were measured and {len(scan) - measured:,} filled in by a model; {len(beside)} of all" in about
-    )
-    seen = np.array(browser.run("[...page.panes[0].points]")).reshape(-1, 4)
-    assert int(seen[:, 3].sum()) == len(scan)
-    assert np.array_equal(seen[-len(beside) :, :3].astype("f4"), beside)
-    assert {tuple(row) for row in beside.tolist()} <= {tuple(row) for row in scan.points_xyz_m.tolist()}
-    assert int(filled.sum()) == int(scan.filled.sum())
-    browser.run("document.querySelector('#mode').value = 'filled'; page.paint()")
-    colours = np.array(browser.run("[...page.panes[0].drawer.colours]")).reshape(-1, 4)[-len(beside) :, :3]
-    for mark, look in enumerate((interactive._MEASURED, interactive._FILLED)):
-        assert set(map(tuple, colours[filled[-len(beside) :] == mark].tolist())) == {tuple(look["dark"])}
-    assert browser.troubles() == []

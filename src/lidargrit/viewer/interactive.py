@@ -202,7 +202,7 @@ def _numbers_of_classes(scan_set: ScanSet) -> list[int]:
     if label is None:
         return []
     found = [label[scan_set.images.return_mask].cpu().long()]
-    found += [one.label.long() & CLASS_BITS for one in scan_set.beside if one.label is not None]
+    found += [one.label.long() & CLASS_BITS for one in scan_set.beside if one and one.label is not None]
     numbers = torch.cat(found).unique().tolist()
     if len(numbers) > _CLASSES_AT_MOST:
         raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")

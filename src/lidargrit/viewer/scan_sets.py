@@ -36,7 +36,7 @@ class ScanSet:
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
             if no model was asked.
         filled: True for pixels whose point a model filled in; None where no scan says so.
-        beside: points of each scan that have no pixel in its image; empty if the scans are no clouds.
+        beside: points of each scan that have no pixel in its image, None for none; empty if the scans are no clouds.
         shows_beside: whether a page shows these points, too, or only counts them.
     """
 
@@ -45,14 +45,14 @@ class ScanSet:
     scan_names: tuple[str, ...]
     surprise: Float[Tensor, "B H W"] | None = None
     filled: Bool[Tensor, "B H W"] | None = None
-    beside: tuple[Scan, ...] = ()
+    beside: tuple[Scan | None, ...] = ()
     shows_beside: bool = False
 
     def hidden(self) -> list[int]:
         """Return how many points of each scan are not shown."""
         if self.shows_beside or not self.beside:
             return [0] * len(self.scan_names)
-        return [len(scan) for scan in self.beside]
+        return [0 if scan is None else len(scan) for scan in self.beside]
 
 
 def load_scan_sets(
@@ -171,7 +171,7 @@ def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, con
         images.append(image)
         names.append(dataset.name(index))
         filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
-        beside.append(replace(scan, rows=None).select(~has_pixel))
+        beside.append(None if bool(has_pixel.all()) else replace(scan, rows=None).select(~has_pixel))
     if not images:
         raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
