@@ -115,7 +115,8 @@ class Browser:
         self.settle()
 
     def click(self, selector: str, which: int = 0) -> None:
-        """Press and release the button in the middle of an element."""
+        """Press and release the button in the middle of an element, once it is in sight."""
+        self.run(f"document.querySelectorAll({selector!r})[{which}].scrollIntoView({{block: 'nearest'}})")
         left, top, width, height = self.box(selector, which)
         self.drag((left + width / 2, top + height / 2), (left + width / 2, top + height / 2))
 

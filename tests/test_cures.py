@@ -13,7 +13,7 @@ from lidargrit.simulator import simulate
 
 VERBS = {  # verb → the words of a command on the scans in IN
     "compare": ["OUT", "marginal", "--reference", "IN", "-n", "2", "--set", "data.train=IN", "data.val=IN"],
-    "complete": ["IN", "OUT", "--model", "linear"],
+    "complete": ["IN/0.bin", "OUT", "--model", "linear"],
     "compress": ["IN", "OUT.lgz"],
     "demo": ["--data", "IN", "--out", "OUT"],
     "evaluate": ["IN", "IN", "--intervals", "0"],

@@ -11,6 +11,7 @@ from lidargrit.scans.fit_sensor import fit_sensor
 from lidargrit.scans.projection import project
 from lidargrit.scans.projection.frame import told_height
 from lidargrit.scans.projection.inspection import inspect
+from lidargrit.scans.projection.sensor_check import closest_sensor
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 from street_corner import COLUMNS, corner, pcd_bytes, rows_of, xyz_of
@@ -70,6 +71,40 @@ def test_the_height_of_a_cars_frame_is_told(height_m):
     where, cure = ("below", "subtract 1.80 m from z") if height_m > 0 else ("above", "add 0.64 m to z")
     assert f"points of a scan are seen from {abs(height_m):.2f} m {where} the sensor (vlp16)" in problems[-1]
     assert problems[-1].endswith(cure)
+
+
+@pytest.mark.parametrize("name", ["vlp16", "hdl32e", "pandar64"])
+def test_the_sensor_of_points_in_a_cars_frame_is_guessed_and_its_height_told(name, tmp_path, capsys):
+    points = xyz_of(corner(0, load_sensor(name), 256)) + torch.tensor([0, 0, 1.8])
+    points = points[torch.randperm(len(points), generator=torch.Generator().manual_seed(0))]
+    assert closest_sensor(Scan(points)) == name
+    np.savez(tmp_path / "a.npz", points=points.numpy())
+    told = f"a.npz are seen from 1.80 m below the sensor ({name})"
+    out = str(tmp_path / "out")
+    fit = ["fit-sensor", "-o", f"{out}.json"]
+    for words in (["inspect"], ["prepare", "-o", out], ["complete", f"{out}_whole", "--model", "linear"], fit):
+        main([words[0], str(tmp_path / "a.npz"), *words[1:]])
+        output = capsys.readouterr()
+        assert told in output.out + output.err, words
+
+
+def test_points_whose_z_counts_from_the_ground_are_doubted():
+    sensor = load_sensor("vlp16").with_columns(256)
+    points = xyz_of(corner(0, sensor, 256)) * torch.tensor([1, 1, 0.9])  # of rows that no model of ours has
+    raised = points + torch.tensor([0, 0, 1.8 * 0.9])
+    told = told_height(Scan(raised), sensor)
+    assert told.startswith("99% of a scan lie above -0.")
+    assert told.endswith("looks down to -15.0; if z counts from the ground, subtract the sensor's height from it")
+    assert told in inspect(Scan(raised), sensor).problems
+    assert told_height(Scan(points), sensor) == ""
+
+
+def test_the_axes_of_a_camera_are_told():
+    x, y, z = xyz_of(corner()).unbind(1)
+    scan = Scan(torch.stack([-y, -z, x], dim=1))
+    for use in (lambda: project(scan, VLP16), lambda: fit_sensor([scan])):
+        with pytest.raises(ScanError, match=r"and over 30 in the axes of a camera; .*save z, -x, -y as x, y, z"):
+            use()
 
 
 @pytest.mark.parametrize("name", ["vlp16", "vlp32c", "hdl32e", "hdl64e_kitti_odometry", "os1_64"])

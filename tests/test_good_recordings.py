@@ -30,7 +30,7 @@ def message(table=None, fields=None, data=None, **changed):
     rows = rows_of(columns)
     field = types["sensor_msgs/msg/PointField"]
     described = [field(name, rows.dtype.fields[name][1], KINDS[rows.dtype[name].str[1:]], 1) for name in columns]
-    described += [field(*each) for each in fields or ()]
+    described = [*described, *(field(*each) for each in fields or ())] if changed.get("step", 1) else []
     data = np.frombuffer(rows.tobytes() if data is None else data, np.uint8)
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 0), "lidar")
     size = rows.dtype.itemsize
@@ -199,8 +199,9 @@ def test_a_recording_of_packets_is_told(tmp_path):
         read_scan(path)
 
 
-def test_an_empty_cloud_is_left_out_by_the_option_that_its_message_names(tmp_path, capsys):
-    empty = message(data=b"", width=0, fields=())
+@pytest.mark.parametrize("has_fields", [True, False])
+def test_an_empty_cloud_is_left_out_by_the_option_that_its_message_names(has_fields, tmp_path, capsys):
+    empty = message(data=b"", width=0, **({} if has_fields else {"step": 0}))
     path = str(mcap(tmp_path / "a.mcap", [("/top", empty)] + [("/top", message(corner(at))) for at in range(3)]))
     for words in (["inspect", path, "--sensor", "vlp16"], ["fit-sensor", path, "-o", str(tmp_path / "f.json")]):
         assert main(words) == 2

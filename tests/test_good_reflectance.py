@@ -101,6 +101,8 @@ def test_verbs_say_what_was_left_out(tmp_path, capsys):
         ["export", str(path), str(tmp_path / "out"), "--format", "npz"],
         ["prepare", str(path), "-o", str(tmp_path / "prepared"), "--sensor", "vlp16", "--set", "data.columns=90"],
         ["fit-sensor", str(path), "-o", str(tmp_path / "mine.json")],
+        ["complete", str(path), str(tmp_path / "completed"), "--model", "linear"],
+        ["rescan", str(path), str(tmp_path / "rescanned"), "--to", "hdl32e"],
     ):
         assert main(words) == 0
         output = capsys.readouterr()

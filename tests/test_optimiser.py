@@ -14,6 +14,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
+from lidargrit.nn.convolution import Residual
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
@@ -88,6 +89,29 @@ def test_muon_moves_the_matrices_of_blocks_and_adamw_all_else(monkeypatch):
         muon.step()
     for (name, got), wanted in zip(ours.named_parameters(), theirs.parameters(), strict=True):
         assert torch.equal(got, wanted), name
+
+
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_muon_takes_the_kernels_of_blocks_as_matrices_of_one_row_a_channel(layout):
+    torch.manual_seed(0)
+    ours = Residual(4).to(memory_format=layout)
+    before = {name: weight.detach().clone() for name, weight in ours.named_parameters()}
+    gradients = {name: torch.randn(weight.shape) for name, weight in ours.named_parameters()}
+    together = make_optimiser(ours, config(optimiser="muon", weight_decay=0.0))
+    for name, weight in ours.named_parameters():
+        weight.grad = gradients[name].clone(memory_format=layout) if weight.ndim == 4 else gradients[name].clone()
+    together.step()
+    for name, weight in ours.named_parameters():
+        assert weight.shape == before[name].shape
+        assert weight.grad is not None
+        assert torch.equal(weight.grad, gradients[name])
+        if weight.ndim == 4:
+            matrix = nn.Parameter(before[name].flatten(1).clone())
+            matrix.grad = gradients[name].flatten(1)
+            Muon([matrix], lr=0.1, weight_decay=0.0, adjust_lr_fn="match_rms_adamw").step()
+            step = (matrix - before[name].flatten(1)).abs().max()
+            # Perhaps in bfloat16, and with the columns in another order.
+            assert (weight.flatten(1) - matrix).abs().max() < 0.02 * step
 
 
 @pytest.mark.parametrize("shape", [(3, 7), (7, 3), (5, 5)])

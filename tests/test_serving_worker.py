@@ -89,8 +89,8 @@ def test_a_part_of_the_circle_is_taken_only_where_lost_returns_are_completed(tas
 @pytest.mark.parametrize(
     ("sensor", "task", "cure"),
     [
-        ("vlp16", "returns", "choose the task 'add the rows a VLP-16 lacks', or a model of the scan's sensor"),
-        ("hdl32e", "returns", "lacks' or 'add the rows a VLP-32C lacks', or a model of the scan's sensor"),
+        ("vlp16", "returns", "choose the task 'Add the rows that a VLP-16 lacks', or a model of the scan's sensor"),
+        ("hdl32e", "returns", "lacks' or 'Add the rows that a VLP-32C lacks', or a model of the scan's sensor"),
         ("os1_128", "returns", "choose a model of the sensor that made the scan, or choose another scan"),
         ("hdl32e", "vlp16", "choose the task that names the sensor of the scan, or choose another scan"),
     ],

@@ -269,16 +269,10 @@ def test_a_run_goes_on_with_settings_that_change_nothing_computed(tmp_path):
 
 
 def test_settings_that_a_later_stage_cannot_follow_are_refused_before_the_first(tmp_path):
-    for settings, message in (
-        (
-            ["training.transformer.batch_size=2", "training.transformer.accumulate=3"],
-            "batch_size=2 on 1 processes in 3 parts",
-        ),
-        (["training.tokenizer.optimiser=muon"], "optimiser=muon for networks without linear layers"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path)
-        assert not [*tmp_path.iterdir()]
+    settings = ["training.transformer.batch_size=2", "training.transformer.accumulate=3"]
+    with pytest.raises(ConfigError, match="batch_size=2 on 1 processes in 3 parts"):
+        train(load_preset("lidargrit_demo", [*TINY, *settings]), tmp_path)
+    assert not [*tmp_path.iterdir()]
     preset = load_preset("r2flow_small")
     with pytest.raises(ConfigError, match=r"without training\.reflow"):
         train(replace(preset, model=replace(preset.model, reflow=ReflowConfig())), tmp_path)

@@ -35,8 +35,10 @@ def write_streets(folder: Path, sensor: SensorModel, first_seed: int, every: int
     Each file holds uint16 (n, H, fine columns), ranges in steps of 2 mm, and is named by its first and last seed.
     """
     fine = sensor.with_columns(sensor.width * sensor.column_stride, 1)
-    seeds = range(first_seed, until_seed, every)
+    seeds, parent = range(first_seed, until_seed, every), os.getppid()
     for begin in range(0, len(seeds), _STREETS_PER_FILE):
+        if os.getppid() != parent:  # the training was killed
+            return
         some = seeds[begin : begin + _STREETS_PER_FILE]
         images = [project(simulate(seed, fine), fine).range_m.numpy() for seed in some]
         with atomic_path(folder / f"{some[0]:07d}_{some[-1]:07d}.npy") as partial, partial.open("wb") as file:

@@ -8,6 +8,7 @@ from lidargrit.cli._options import add_device
 
 EXAMPLES = """\
   lidargrit serve                          all runs in runs/ and the models in the package
+  lidargrit serve --open                   the same, and opens the page in the browser
   lidargrit serve runs/demo runs/mine --port 8080
   ssh -L 8000:localhost:8000 MACHINE       and then here: a far machine's page in a browser here
 """
@@ -25,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     others = "address to listen at; 0.0.0.0 lets other machines in (default: 127.0.0.1, this machine only)"
     parser.add_argument("--host", default="127.0.0.1", help=others)
     parser.add_argument("--port", type=int, default=8000, help="port to listen at; 0 for any free one")
+    parser.add_argument("--open", action="store_true", help="open the page in this machine's browser, too")
     parser.add_argument("--seconds", type=float, default=120.0, help="time limit of one request, in seconds")
     add_device(parser)
 
@@ -37,4 +39,4 @@ def run(options: argparse.Namespace) -> None:
     say = partial(print, flush=True)
     runs = [named_folder(run) for run in options.runs] or finished_runs(Path("runs"), say)
     limits = Limits(seconds=options.seconds)
-    serve(runs, say, options.host, options.port, options.device, limits)
+    serve(runs, say, options.host, options.port, options.device, limits, options.open)

@@ -1,6 +1,5 @@
 """Scans for other programs: samples, prepared scans or a data set → a folder of point clouds, or a KITTI tree."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +55,12 @@ def export_scans(
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     with folder.writing("exporting") as progress:
-        told = _told_notes(source, scans.notes, set())
         for index in folder.missing:
             with folder.leaving_out(index):
                 layout.write(files[index], scan := read(index))
                 if scan.label is not None and not layout.keeps_labels:
                     folder.tell_labels_lost(files[index])
-                told = _told_notes(scan.source, scan.notes, told)
+                scans.tell_notes(scan)
             progress.advance(1)
     return folder.num_written
 
@@ -80,14 +78,6 @@ class _Changed:
             reporting.message(f"{printable(changed.scan.source)}: {changed.told}")
             self._told = True
         return changed.scan
-
-
-def _told_notes(of: str, notes: Sequence[str], told: set[str]) -> set[str]:
-    """Report notes that were not told yet, and return all that were."""
-    for note in notes:
-        if note not in told:
-            reporting.message(f"{printable(of)}: {note}")
-    return told | {*notes}
 
 
 def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> tuple[NamedScans, dict[str, Any]]:

@@ -30,9 +30,9 @@ class TrainingConfig(Settings):
             ``linear_second_half`` stays constant for the first half and falls to 0 over the second, as LidarGRIT's
             program does for its KITTI-360 transformer.
         warmup_scans: number of scans over which the learning rate rises linearly from 0.
-        optimiser: ``adamw``, as in all papers here, or ``muon``: Muon for the linear layers in a transformer's blocks,
-            whose updates it makes orthogonal (Jordan et al., 2024), and AdamW for all other weights. A transformer
-            learns more from equally many scans with it.
+        optimiser: ``adamw``, as in all papers here, or ``muon``: Muon for the linear layers and convolutions in blocks,
+            whose updates it makes orthogonal (Jordan et al., 2024), and AdamW for all other weights. Transformers and
+            pixel decoders learn more from equally many scans with it.
         betas: decay rates of Adam's two moments.
         weight_decay: decay of the weights of linear layers; other weights do not decay, as in LidarGRIT's program.
         gradient_clip: largest norm of the gradient; 0 for no limit.

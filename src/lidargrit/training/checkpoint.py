@@ -79,7 +79,7 @@ def _optimiser_state(tensors: dict[str, Tensor], optimiser: torch.optim.Optimize
         for weight in group["params"]:
             moments = state.get(number, {})
             kinds |= {frozenset(moments)} if moments else set()
-            if any(moment.numel() != 1 and moment.shape != weight.shape for moment in moments.values()):
+            if any(moment.numel() not in (1, weight.numel()) for moment in moments.values()):
                 raise ValueError(f"moments of another size for weight {number}")
             number += 1
         if len(kinds) > 1:

@@ -2,6 +2,8 @@
 
 import copy
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -21,9 +23,9 @@ def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.
     Weights of linear layers decay; biases, norms, convolutions and embeddings do not.
     """
     learned = [parameter for parameter in objective.parameters() if parameter.requires_grad]
-    decaying = _ids_of_linear_weights(objective)
+    decaying = _ids_of_weights(objective, (nn.Linear,))
     blocks = [module for module in objective.modules() if isinstance(module, Block)]
-    hidden = set().union(*map(_ids_of_linear_weights, blocks)) if config.optimiser == "muon" else set()
+    hidden = set().union(*map(_ids_of_weights, blocks)) if config.optimiser == "muon" else set()
     matrices = [p for p in learned if id(p) in hidden]
     others = [p for p in learned if id(p) not in hidden]
     groups = [
@@ -37,29 +39,54 @@ def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.
         return adamw
     if not matrices:
         raise ConfigError(
-            "optimiser=muon for networks without linear layers in blocks",
-            "a stage with a transformer",
+            "optimiser=muon for networks without linear layers or convolutions in blocks",
+            "a stage with a transformer or residual blocks",
             "leave the stage's optimiser out: adamw is the default",
         )
-    muon = Muon(
-        matrices,
-        lr=config.learning_rate,
-        weight_decay=config.weight_decay,
-        adjust_lr_fn="match_rms_adamw",  # so that one learning rate suits both optimisers
-    )
-    return _Together([muon, adamw])
+    with _as_matrices(matrices):
+        muon = Muon(
+            matrices,
+            lr=config.learning_rate,
+            weight_decay=config.weight_decay,
+            adjust_lr_fn="match_rms_adamw",  # so that one learning rate suits both optimisers
+        )
+    return _Together([muon, adamw], matrices)
 
 
-def _ids_of_linear_weights(module: nn.Module) -> set[int]:
-    return {id(part.weight) for part in module.modules() if isinstance(part, nn.Linear)}
+def _ids_of_weights(module: nn.Module, kinds: tuple[type[nn.Module], ...] = (nn.Linear, nn.Conv2d)) -> set[int]:
+    return {id(part.get_parameter("weight")) for part in module.modules() if isinstance(part, kinds)}
+
+
+@contextmanager
+def _as_matrices(weights: Sequence[nn.Parameter]) -> Iterator[None]:
+    """Give each kernel and its gradient the shape of a matrix of one row for each output channel, as Muon takes it."""
+    kernels = [(weight, weight.data, weight.grad) for weight in weights if weight.ndim > 2]
+    for weight, values, gradient in kernels:
+        inner = not values.is_contiguous()  # channels lie innermost; their order among the columns is no matter
+        weight.grad = None
+        weight.data = (values.movedim(1, -1) if inner else values).view(len(values), -1)
+        if gradient is not None:
+            weight.grad = (gradient.movedim(1, -1) if inner else gradient).flatten(1)
+    try:
+        yield
+    finally:
+        for weight, values, gradient in kernels:
+            weight.grad = None
+            weight.data = values
+            weight.grad = gradient
 
 
 class _Together(torch.optim.Optimizer):
-    """Several optimisers that step as one; their parameter groups and their states are those of this one."""
+    """Several optimisers that step as one; their parameter groups and their states are those of this one.
 
-    def __init__(self, parts: list[torch.optim.Optimizer]) -> None:
+    Args:
+        parts: the optimisers.
+        matrices: weights that take the shape of matrices while the optimisers step.
+    """
+
+    def __init__(self, parts: list[torch.optim.Optimizer], matrices: Sequence[nn.Parameter]) -> None:
         super().__init__([group for part in parts for group in part.param_groups], {})
-        self._parts = parts
+        self._parts, self._matrices = parts, matrices
         self._share()
 
     def _share(self) -> None:
@@ -74,8 +101,9 @@ class _Together(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]
-        for part in self._parts:
-            part.step()
+        with _as_matrices(self._matrices):
+            for part in self._parts:
+                part.step()
 
 
 def memory_of_weights(objective: nn.Module) -> int:

@@ -151,7 +151,8 @@ def _chosen(topics: Counter[str], path: Path, types: Collection[str], wanted: st
     there = ", ".join(f"{printable(topic)[:80]} ({topics[topic]:,})" for topic in others[:3])
     more = f" and {len(others) - 3} more" if len(others) > 3 else ""
     cure = f"choose by {printable(path.name)}:{printable(others[0])[:80]}"
-    return taken, (f"topic {printable(taken)[:80]} taken ({topics[taken]:,} clouds), not {there}{more}; {cure}",)
+    clouds = f"{topics[taken]:,} {'cloud' if topics[taken] == 1 else 'clouds'}"
+    return taken, (f"topic {printable(taken)[:80]} taken ({clouds}), not {there}{more}; {cure}",)
 
 
 def _named(types: Collection[str]) -> str:

@@ -7,10 +7,8 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.scans.projection import doubts_about_rays, projection_that_fits
-from lidargrit.scans.projection.frame import told_height
-from lidargrit.scans.projection.revolutions import told_revolutions
-from lidargrit.scans.projection.sensor_check import told_doubt
+from lidargrit.scans.projection import projection_that_fits
+from lidargrit.scans.projection.sensor_check import told_doubts
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
@@ -60,12 +58,9 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
     if fitting - {sensor.projection}:
         sensor, config = replace(sensor, projection="spherical"), replace(config, projection_variant="exact")
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
-    doubts_of_scans = (doubts_about_rays(scan, sensor, sensor.projection) for scan in probes)
-    doubt = next((each for each in doubts_of_scans if each), "")
-    turns = next((told for scan in probes if (told := told_revolutions(scan))), "")
-    height = next((told for scan in probes if (told := told_height(scan, sensor))), "")
-    told = (told_doubt(source, sensor, doubt), turns, height)
-    return Imaging(sensor, config, tuple(notes), tuple(filter(None, told)))
+    told_of_scans = (told_doubts(scan, sensor, sensor.projection, source) for scan in probes)
+    first_of_each = (next(filter(None, told), "") for told in zip(*told_of_scans, strict=True))
+    return Imaging(sensor, config, tuple(notes), tuple(filter(None, first_of_each)))
 
 
 def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:

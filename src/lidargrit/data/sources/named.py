@@ -1,12 +1,14 @@
 """An opened source → its scans one after the other, each with the name of the file that is written for it."""
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import OutputError
+from lidargrit.core.errors import OutputError, printable
 from lidargrit.data.datasets import ScanDataset, Window
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -17,12 +19,11 @@ from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
+_NUMBER = re.compile(r"-?\d[\d.,]*")
+
 
 class NamedScans(ABC):
     """Scans of a source, evenly spaced where fewer than all are wanted."""
-
-    notes: tuple[str, ...] = ()
-    """Sentences on files that were left out."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -52,6 +53,10 @@ class NamedScans(ABC):
         return None
 
     @abstractmethod
+    def tell_notes(self, scan: Scan) -> None:
+        """Report what is noted of the source and of a scan that was read from it, but nothing twice."""
+
+    @abstractmethod
     def check_output(self, out: Path) -> None:
         """Refuse a folder whose files would become scans of the source."""
 
@@ -64,8 +69,8 @@ class PointScans(NamedScans):
     """
 
     def __init__(self, dataset: ScanDataset, max_scans: int) -> None:
-        self.notes = dataset.notes
         self._dataset, self._indices = dataset, evenly_spaced(max_scans or len(dataset), len(dataset))
+        self._told = set[str]()
 
     def __len__(self) -> int:
         return len(self._indices)
@@ -90,6 +95,14 @@ class PointScans(NamedScans):
         """Read its points, time and pose."""
         (scan,) = Window(self._dataset, (self._indices[index],)).scans()
         return scan
+
+    def tell_notes(self, scan: Scan) -> None:
+        """Report what is noted of the data set and of a scan; notes that differ in numbers alone once."""
+        for of, notes in ((str(self._dataset.root), self._dataset.notes), (scan.source, scan.notes)):
+            for note in notes:
+                if (kind := _NUMBER.sub("", note)) not in self._told:
+                    self._told.add(kind)
+                    reporting.message(f"{printable(of)}: {note}")
 
     def path(self, index: int) -> Path | None:
         """Return its file."""
@@ -135,6 +148,9 @@ class ImageScans(NamedScans):
     def scan(self, index: int) -> Scan:
         """Return a point for each return."""
         return unproject(self.image(index))
+
+    def tell_notes(self, scan: Scan) -> None:
+        """Report nothing: pixels have no notes."""
 
     def check_output(self, out: Path) -> None:
         """Accept every folder: images are looked for in one folder alone, by names that are not written there."""

@@ -21,7 +21,6 @@ from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.scans.projection import (
     ProjectionVariant,
-    doubts_about_rays,
     index_map,
     project,
     project_by_what_fits,
@@ -29,7 +28,7 @@ from lidargrit.scans.projection import (
 )
 from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates, pixel_coordinates
-from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count, told_doubt
+from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count, told_doubts
 from lidargrit.scans.sensors import ProjectionOption, SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
@@ -141,6 +140,7 @@ class Inputs:
         if isinstance(self._scans, ImageScans):
             return InputScan(self._scans.image(index))
         points = self._scans.scan(index)
+        self._scans.tell_notes(points)
         scan = self._reader.read(points) if see is None else see(points)
         if not self._counted and see is None:
             self._counted = True
@@ -185,12 +185,11 @@ class ScanReader:
             variant = self.variant if method == self.sensor.projection else "exact"
             image = project(scan, self.sensor, method, variant, self.partial)
         at = index_map(scan, self.sensor, method, variant, self.partial)[:, :: self.sensor.column_stride]
-        doubt = doubts_about_rays(scan, self.sensor, method)
-        said = told_doubt(scan.source, self.sensor, doubt)
+        doubt = "; ".join(filter(None, told_doubts(scan, self.sensor, method)))
         pixels = pixel_coordinates(scan, self.sensor, method, variant)
         pixels = replace(pixels, column=pixels.column // self.sensor.column_stride, width=self.sensor.width)
         at = torch.from_numpy(at.astype(np.int64))
-        return InputScan(image, scan, at, doubt=said, pixels=pixels, by_ring=method == "unfolding")
+        return InputScan(image, scan, at, doubt=doubt, pixels=pixels, by_ring=method == "unfolding")
 
 
 def images_for(models: Sequence[Model], source: str, settings: ScanSettings) -> RangeImages:

@@ -68,6 +68,8 @@ def segment_scans(
         for index in wanted:
             with folder.leaving_out(index):
                 scan = source_scans.scan(index)
+                if scores is None:  # else the user knows that labels are of another numbering
+                    source_scans.tell_notes(scan)
                 label = labels.of(index, scan)
                 if index in folder.missing:
                     write_with_labels(out / files[index], replace(scan, label=label))

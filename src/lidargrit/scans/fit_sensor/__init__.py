@@ -18,8 +18,10 @@ from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
 from lidargrit.scans.many_scans import ManyScans, usable_scans
+from lidargrit.scans.projection.frame import told_height
 from lidargrit.scans.projection.revolutions import told_revolutions
-from lidargrit.scans.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad
+from lidargrit.scans.projection.sensor_check import closest_sensor
+from lidargrit.scans.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.scans.types import Scan
 
 __all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_dataset"]
@@ -98,14 +100,14 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     rings = recover_rings(everything)
     rows, rings = _rows_by_order(everything, rings) if rings else (None, None)
     if rows is None or rings is None:
-        rows, rings = _rows_by_elevation(everything, scans[0].source)
+        rows, rings = _rows_by_elevation(everything, scans[0])
     used = [everything[index] for index in rings.used]
     if len(rows.elevation_deg) < 2 or rows.agree_share < _AGREE_AT_LEAST:
         raise ScanError(
             f"points of {len(rows.elevation_deg)} rings, {rows.agree_share:.0%} of them near their ring's elevation, "
             f"in {scans[0].source}",
             "rings of points as a turning sensor with several lasers sees them from its own place",
-            "give scans in the sensor's own frame, of one sensor, each of one revolution",
+            "give scans in the sensor's own frame, of one sensor, each of one revolution" + _seen_from(scans[0]),
         )
     row_of_point = tuple(_row_numbers(rows, number) for number in rings.of_point)
     steps = firing_steps_deg(used, row_of_point)
@@ -174,21 +176,28 @@ def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[FittedRows | 
     return rows, rings
 
 
-def _rows_by_elevation(scans: Sequence[Points], source: str) -> tuple[FittedRows, Rings]:
+def _rows_by_elevation(scans: Sequence[Points], first: Scan) -> tuple[FittedRows, Rings]:
     """Find rows where elevations gather, and give every point the nearest."""
     elevation = np.concatenate([points.elevation_deg for points in scans])
     range_m = np.concatenate([points.range_m for points in scans])
     peaks, share = cluster_rows(elevation, range_m)
     if len(peaks) < 2:
         raise ScanError(
-            f"no rings in {source}: its elevations do not gather",
+            f"no rings in {first.source}: its elevations do not gather",
             "points of a turning sensor, seen from its own place",
-            "give single scans, not maps, in the sensor's own frame and in the order in which they were fired",
+            "give single scans, not maps, in the sensor's own frame and in the order in which they were fired"
+            + _seen_from(first),
         )
     numbers = tuple(nearest_row(points.elevation_deg, peaks) for points in scans)
     rows = rows_of_rings(elevation, range_m, np.concatenate(numbers))
     rows = replace(rows, agree_share=share)
     return rows, Rings("elevation clusters", numbers, tuple(range(len(scans))))
+
+
+def _seen_from(scan: Scan) -> str:
+    """Return what is known of the place from which a sensor of the package saw a scan, as the end of a message."""
+    told = told_height(scan, load_sensor(closest_sensor(scan)))
+    return f" ({told})" if told else ""
 
 
 def _row_numbers(rows: FittedRows, number: Int64[np.ndarray, "n"]) -> Int64[np.ndarray, "n"]:

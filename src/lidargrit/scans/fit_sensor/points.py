@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from lidargrit.core.errors import ScanError
-from lidargrit.scans.projection.frame import far_away
+from lidargrit.scans.projection.frame import other_frame
 from lidargrit.scans.types import Scan
 
 NOISE_RANGE_M = 1.0  # nearer points are the car that carries the sensor, or placeholders: their angles mean little
@@ -40,8 +40,8 @@ class Points:
     @classmethod
     def of_scan(cls, scan: Scan) -> "Points":
         """Return the points of a scan, or refuse one that cannot show its sensor."""
-        if far := far_away(scan):
-            raise far
+        if frame := other_frame(scan):
+            raise frame
         x, y, z = scan.points_xyz_m.double().numpy().T
         flat = np.hypot(x, y)
         range_m = np.hypot(flat, z)

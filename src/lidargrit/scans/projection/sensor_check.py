@@ -9,7 +9,7 @@ from torch import Tensor
 from lidargrit.core import discovery
 from lidargrit.core.errors import ScanError
 from lidargrit.scans.projection import spherical, unfolding
-from lidargrit.scans.projection.frame import far_away
+from lidargrit.scans.projection.frame import MOST_ON_ROWS, Heights, other_frame, told_height
 from lidargrit.scans.projection.pixel_coordinates import (
     PixelCoordinates,
     ProjectionVariant,
@@ -17,6 +17,7 @@ from lidargrit.scans.projection.pixel_coordinates import (
     row_elevation_rad,
     within_limits,
 )
+from lidargrit.scans.projection.revolutions import told_revolutions
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.scans.types import Scan
 
@@ -29,7 +30,7 @@ _SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the c
 # order that is none, or upside down, or by rings of another sensor: 0.24 and more.
 _MISPLACED_AT_MOST = 0.125
 _POINTS_FOR_ORDER = 100  # fewer do not show an order
-_POINTS_MEASURED = 8192
+_POINTS_MEASURED, _POINTS_FOR_HEIGHT = 8192, 512
 _WITHIN_RINGS_AT_MOST = (
     0.1  # share of the elevations' variance; 0.01 in files stored ring by ring, 0.9 in shuffled ones
 )
@@ -65,9 +66,9 @@ def fit_problems(
     rows = _misplaced(scan, sensor, method, pixels, variant)
     if variant == "exact":
         rows = _wrong_rows(scan, sensor, method, pixels) or rows
-    far = far_away(scan) if variant == "exact" else None
-    yield from [far] if far else []
-    for check in (None if partial or far or variant != "exact" else _part_of_a_circle(scan), rows):
+    frame = other_frame(scan) if variant == "exact" else None
+    yield from [frame] if frame else []
+    for check in (None if partial or frame or variant != "exact" else _part_of_a_circle(scan), rows):
         if check is not None:
             yield check
 
@@ -151,10 +152,18 @@ def _empty_between(has_points: Bool[np.ndarray, "H W"]) -> float:
     return float(empty.sum() / max(1, (empty | has_points).sum()))
 
 
-def told_doubt(source: str, sensor: SensorModel, doubt: str) -> str:
-    """Return what a person reads of a doubt about the sensor of a source; "" without one."""
-    cure = f"{_NAME_IT}, or take a model of it, {FIT_SENSOR}"
-    return f"{source}, imaged as {sensor.name}: {doubt}; {cure}" if doubt else ""
+def told_doubts(scan: Scan, sensor: SensorModel, method: ProjectionName, source: str = "") -> tuple[str, str]:
+    """Return what a person reads of signs that another sensor, or one elsewhere, made a scan, and of its revolutions.
+
+    Args:
+        source: name of the scan's source; its own if not given.
+
+    Returns:
+        a sentence each, "" where there is no such sign.
+    """
+    if not (doubt := told_height(scan, sensor)) and (about := doubts_about_rays(scan, sensor, method)):
+        doubt = f"{source or scan.source}, imaged as {sensor.name}: {about}; {_NAME_IT}, or take a model of it, {FIT_SENSOR}"
+    return doubt, told_revolutions(scan)
 
 
 def sensors_that_fit(scan: Scan) -> list[str]:
@@ -179,7 +188,8 @@ def closest_sensor(scan: Scan) -> str:
     """Guess the bundled sensor: that whose rows are nearest to the scan's rings, of those with as many rows.
 
     If the scan neither names its rings nor is stored ring by ring, or no sensor has as many rows, the most similar span
-    of elevations decides.
+    of elevations decides; where its points do not lie on that sensor's rows, but on those of one that stands higher or
+    lower, it is that one.
     """
     sensors = {name: load_sensor(name) for name in discovery.names("sensors")}
     if off_deg := _distances_of_rows_deg(scan, sensors):
@@ -190,7 +200,12 @@ def closest_sensor(scan: Scan) -> str:
         bottom_deg, top_deg = _span_of_rows_deg(sensors[name])
         return abs(bottom_deg - low_deg) + abs(top_deg - high_deg)
 
-    return min(sensors, key=distance_deg)
+    nearest = min(sensors, key=distance_deg)
+    if Heights(scan, sensors[nearest], _POINTS_FOR_HEIGHT).are_own():
+        return nearest
+    moved = {name: Heights(scan, sensor, _POINTS_FOR_HEIGHT).best()[0] for name, sensor in sensors.items()}
+    name = max(moved, key=moved.__getitem__)
+    return name if moved[name] >= MOST_ON_ROWS else nearest
 
 
 def _distances_of_rows_deg(scan: Scan, sensors: dict[str, SensorModel]) -> dict[str, float] | None:
@@ -329,7 +344,7 @@ def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanEr
         f"{outside:.0%} of the points of {scan.source} outside the sensor's elevations (the scan spans "
         f"{low_deg:.1f} to {high_deg:.1f} degrees)",
         f"{bottom_deg:.1f} to {top_deg:.1f} degrees for {sensor.name!r}",
-        _name_sensor(scan, sensor),
+        told_height(scan, sensor) or _name_sensor(scan, sensor),
     )
 
 

@@ -30,7 +30,7 @@ from lidargrit.systems.pyramid.network import Level, ParentNetwork, halved_senso
 
 _ROW_HALVINGS = 2  # of a level's phases: then pixels above one another know of one another, as those of a pole have to
 _LEVELS_AT_MOST = 16
-_SHARES = (1 / 16, 1 / 8, 1 / 2)  # of a batch, from which the finest levels learn: they have the most pixels in a scan
+_SHARES = (1 / 64, 1 / 32, 1 / 8)  # of the scans, from which the finest levels learn: they have the most pixels
 
 
 @dataclass(frozen=True)
@@ -159,8 +159,8 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
 class PyramidObjective(Objective):
     """Negative log-likelihood of every level, each given the true coarser levels.
 
-    In training the three finest levels learn from a sixteenth, an eighth and half of each batch: coarser ones have
-    fewer pixels to learn from.
+    In training the three finest levels learn from one scan in 64, in 32 and in 8: coarser ones have fewer pixels to
+    learn from. A batch that has no scan for a level leaves that level's weights as they are.
 
     Args:
         levels: the levels, the finest first.
@@ -174,30 +174,37 @@ class PyramidObjective(Objective):
         self.levels = levels
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return the sum over all levels of nats of the mask a pixel, and of the range a pixel, as ``loss``.
+        """Return the sum over levels of nats of the mask a pixel, and of the range a pixel, as ``loss``.
 
-        Beside it are the bits of the finest level, given the coarser one: a pixel's mask and a return's range.
+        In evaluation, beside it are the bits of every level, given the coarser ones: a pixel's mask and a return's
+        range. Those of the scan itself have plain names, those of others the number of rows behind.
         """
         levels = levels_of(self.levels)
         pyramid = images_of(levels, example.images)
         if self.training:
-            pyramid = [images[: _learned_from(len(images), number)] for number, images in enumerate(pyramid)]
+            return {"loss": self._estimate(levels, pyramid, rng)}
         loss = example.images.range_m.new_zeros(())
         terms: dict[str, Tensor] = {}
         for level, images, guide in zip(levels, pyramid, guides_of(levels, pyramid), strict=True):
-            returned = images.return_mask.float().mean()
-            if self.training:
-                mask_nats, range_nats = level.pixels.estimate(guide, images, rng)
-            else:
-                nll = level.pixels(guide, images)
-                mask_nats = nll.mask.mean()
-                range_nats = nll.range.sum() / images.return_mask.sum().clamp(min=1)
-            loss = loss + mask_nats + returned * range_nats
-            bits = mask_nats / math.log(2), nats_to_range_bits(range_nats)
-            rows = f"_{level.sensor.height}" if terms else ""  # the finest level has the plain names
-            names = f"mask_bits{rows}", f"range_bits{rows}"
-            terms |= {name: value.detach() for name, value in zip(names, bits, strict=True)}
+            nll = level.pixels(guide, images)
+            returns = images.return_mask.sum()
+            loss = loss + nll.mask.mean() + nll.range.sum() / images.return_mask.numel()
+            rows = f"_{level.sensor.height}" if terms else ""
+            terms[f"mask_bits{rows}"] = nll.mask.mean() / math.log(2)
+            terms[f"range_bits{rows}"] = nats_to_range_bits(nll.range.sum() / returns.clamp(min=1))
         return {"loss": loss, **terms}
+
+    def _estimate(self, levels: list[Level], pyramid: list[RangeImage], rng: torch.Generator) -> Tensor:
+        chance = float(torch.rand((), generator=rng))
+        shares = (_SHARES[: len(levels) - 1] + (1.0,) * len(levels))[: len(levels)]
+        counts = [int(len(pyramid[0]) * share + chance) for share in shares]
+        learned = [images[:count] for images, count in zip(pyramid, counts, strict=True) if count]
+        levels = levels[len(levels) - len(learned) :]
+        loss = pyramid[0].range_m.new_zeros(())
+        for level, images, guide in zip(levels, learned, guides_of(levels, learned), strict=True):
+            mask_nats, range_nats = level.pixels.estimate(guide, images, rng)
+            loss = loss + mask_nats + images.return_mask.float().mean() * range_nats
+        return loss
 
 
 def levels_of(modules: nn.ModuleList) -> list[Level]:
@@ -226,11 +233,6 @@ def guides_of(levels: list[Level], pyramid: list[RangeImage]) -> list[Decoded | 
         guide, told = level.guided(None if coarser is None else coarser[:count], None if told is None else told[:count])
         guides.append(guide)
     return guides[::-1]
-
-
-def _learned_from(scans: int, number: int) -> int:
-    """Return of how many scans of a batch a level learns."""
-    return scans if number >= len(_SHARES) else max(1, round(scans * _SHARES[number]))
 
 
 def _level(config: PyramidConfig, number: int, sensors: list[SensorModel]) -> Level:

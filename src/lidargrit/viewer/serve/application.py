@@ -177,11 +177,13 @@ class Application:
             text = urllib.parse.unquote_to_bytes(query.removeprefix("request="))
         request = parse_request(parse_json_object(text), self._settings, self._queue.limits)
         if path == "/complete":
-            self._check_upload(request, size)
+            self._check_task(request)
+            if not request.example:
+                self._check_upload(request.name, size)
         folder, name = None, None
         try:
             folder = self._queue.new_folder()
-            if path == "/complete":
+            if path == "/complete" and not request.example:
                 request = dataclasses.replace(request, file=str(folder / f"upload{upload_ending(request.name)}"))
                 with Path(request.file).open("wb") as file:
                     shutil.copyfileobj(body, file)
@@ -196,8 +198,8 @@ class Application:
             raise RefusedRequestError("503 Service Unavailable", busy)
         return Response("202 Accepted", json.dumps({"job": name}).encode())
 
-    def _check_upload(self, request: SampleRequest, size: int) -> None:
-        model, name = self._queue.models[request.model], request.name
+    def _check_task(self, request: SampleRequest) -> None:
+        model = self._queue.models[request.model]
         if not model["upload"]:
             raise ConfigError(
                 f"a scan for {model['name']}, which can neither complete nor reconstruct one",
@@ -210,11 +212,13 @@ class Application:
                 one_of([repr(TASKS[task]) for task in model["tasks"]]),
                 "choose another task",
             )
+
+    def _check_upload(self, name: str, size: int) -> None:
         if not upload_ending(name):
             raise ConfigError(
-                f"the file {name or 'without a name'!r}, which cannot be read here by itself",
-                f"an ending among {', '.join(upload_endings())}",
-                "convert it with lidargrit export",
+                f"the file {name or 'without a name'!r}, which is no LiDAR scan that this page reads",
+                f"one revolution in a file that ends in {', '.join(upload_endings())}",
+                "choose such a file, or an example",
             )
         if not 0 < size <= self._queue.limits.upload_bytes:
             most = f"1 to {self._queue.limits.upload_bytes:,} bytes"

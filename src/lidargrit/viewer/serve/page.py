@@ -6,7 +6,7 @@ from lidargrit.core.untrusted import SEED_AT_MOST
 from lidargrit.core.version import __version__
 from lidargrit.viewer import interactive
 from lidargrit.viewer.interactive import button, filled
-from lidargrit.viewer.serve.requests import TASKS, upload_endings
+from lidargrit.viewer.serve.requests import EXAMPLES, TASKS, upload_endings
 
 _FOLDER = Path(__file__).parent / "browser"
 _SAVED = ("npz", "ply", "bin")
@@ -17,7 +17,8 @@ def page() -> str:
     buttons = "".join(button(kind, f".{kind}") for kind in _SAVED) + button("remove", "Remove")
     parts = {
         "viewer": interactive.viewer_html("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
-        "tasks": "".join(f'<option value="{name}">{text}</option>' for name, text in TASKS.items()),
+        "tasks": "".join(f'<button name="task" value="{name}">{text}</button>' for name, text in TASKS.items()),
+        "examples": "".join(_example(name) for name in EXAMPLES),
         "seed_at_most": str(SEED_AT_MOST),
         "endings": ",".join(upload_endings()),
         "listed_endings": ", ".join(upload_endings()),
@@ -33,6 +34,11 @@ def script() -> str:
 def style() -> str:
     """Return the style sheet of the page."""
     return interactive.style() + _read("serve.css")
+
+
+def _example(name: str) -> str:
+    example = EXAMPLES[name]
+    return f'<button type="button" data-example="{name}" data-task="{example.task}">{example.words}</button>'
 
 
 def _read(name: str) -> str:

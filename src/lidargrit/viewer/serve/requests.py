@@ -2,9 +2,10 @@
 
 import inspect
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from lidargrit.core.configuration import own_first
 from lidargrit.core.discovery import names
@@ -15,13 +16,36 @@ from lidargrit.data import formats
 from lidargrit.viewer.serve.limits import Limits
 
 UPSAMPLED = {"vlp16": "a VLP-16", "hdl32e": "an HDL-32E", "vlp32c": "a VLP-32C"}  # sensors with few rows
-TASKS = {  # what a model makes of an uploaded scan → its description on the page
-    "returns": "fill in rays without a point",
-    "ahead": "fill in the quarter ahead",
-    "rows": "fill in three rows of four",
-    "region": "fill in a region",
-    **{sensor: f"add the rows {name} lacks" for sensor, name in UPSAMPLED.items()},
-    "raydrop": "drop returns of a clean scan",
+TASKS = {  # what a model makes of a scan → the words of its button on the page
+    "ahead": "Fill the quarter ahead",
+    "region": "Fill a region that you draw",
+    "returns": "Fill rays without a point",
+    "rows": "Fill three rows of four",
+    **{sensor: f"Add the rows that {name} lacks" for sensor, name in UPSAMPLED.items()},
+    "raydrop": "Drop rays of a clean scan",
+}
+
+
+class Example(NamedTuple):
+    """A simulated street to try a task on.
+
+    Args:
+        words: text of its button on the page.
+        task: the task that its button asks for.
+        sensor: name of the sensor that sees it; "" for that of the model.
+        every_beam_returns: whether no beam is lost.
+    """
+
+    words: str
+    task: str
+    sensor: str = ""
+    every_beam_returns: bool = False
+
+
+EXAMPLES = {
+    "street": Example("A street", "ahead"),
+    "vlp16": Example("16 rows of a VLP-16", "vlp16", sensor="vlp16"),
+    "clean": Example("A street without raydrop", "raydrop", every_beam_returns=True),
 }
 _WHOLE_AT_MOST = 1024  # steps and the like: four times what any published sampler takes
 _FRACTION_AT_MOST = 100.0  # temperatures and the like: far beyond, everything is noise
@@ -48,17 +72,18 @@ class SamplingSetting:
 
 @dataclass(frozen=True)
 class SampleRequest:
-    """What a client asks for: new scans, or a completed or reconstructed uploaded scan.
+    """What a client asks for: new scans, or what a model makes of a scan that is uploaded or an example.
 
     Args:
         model: index of the model among those that are served.
         seed: seed of the first scan; the next scan has the next seed.
         count: number of scans.
         sampling: values of the sampling settings that the client changed, by name.
-        task: name of the work on the uploaded scan, a key of :data:`TASKS`.
+        task: name of the work on the scan, a key of :data:`TASKS`.
         region: left, top, right and bottom edge of the region that is to be filled in, as shares of the image's width
             and height; empty if none was drawn.
         file: path of the uploaded scan; "" if there is none.
+        example: name of the example in place of an uploaded scan, a key of :data:`EXAMPLES`; "" if there is none.
         name: name of the uploaded file on the client's side, for display.
     """
 
@@ -69,7 +94,13 @@ class SampleRequest:
     task: str = "returns"
     region: tuple[float, ...] = ()
     file: str = ""
+    example: str = ""
     name: str = ""
+
+    @property
+    def has_scan(self) -> bool:
+        """Return whether there is a scan that the model works on."""
+        return bool(self.file or self.example)
 
 
 def sampling_settings(sampling: Any) -> list[SamplingSetting]:
@@ -104,14 +135,13 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
         settings: sampling settings of each model that is served.
         limits: bounds on what may be asked for.
     """
-    known = ("model", "seed", "count", "sampling", "task", "region", "name")
+    known = ("model", "seed", "count", "sampling", "task", "region", "example", "name")
     for name in values:
         if name not in known:
             raise ConfigError(f"the word {name[:40]!r}", f"one of {', '.join(known)}", "use the page")
     model = _whole("model", values.get("model", 0), 0, len(settings) - 1)
-    task = values.get("task", "returns")
-    if not isinstance(task, str) or task not in TASKS:
-        raise ConfigError(f"task={str(task)[:40]!r}", f"one of {', '.join(TASKS)}", "choose one")
+    task = _key("task", values.get("task", "returns"), TASKS)
+    example = _key("example", values.get("example", ""), ("", *EXAMPLES))
     changed = values.get("sampling", {})
     if not isinstance(changed, dict):
         raise ConfigError("sampling that is not a JSON object", "numbers by name", "use the page")
@@ -132,7 +162,8 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
         {name: _number(by_name[name], value) for name, value in changed.items()},
         task,
         _region(values.get("region", [])),
-        name=_harmless_name(values.get("name", "")),
+        example=example,
+        name=f"example {example}" if example else _harmless_name(values.get("name", "")),
     )
 
 
@@ -154,6 +185,12 @@ def _about(sampling: type, name: str) -> str:
     text = "\n".join(inspect.cleandoc(each.__doc__ or "") for each in sampling.__mro__)
     found = re.search(rf"^    {name}: (.*?)(?=^    \w+: |^\S|\Z)", text, re.MULTILINE | re.DOTALL)
     return " ".join(found[1].split()).replace("``", "") if found else ""
+
+
+def _key(name: str, value: Any, known: Collection[str]) -> str:
+    if not isinstance(value, str) or value not in known:
+        raise ConfigError(f"{name}={str(value)[:40]!r}", f"one of {', '.join(filter(None, known))}", "choose one")
+    return value
 
 
 def _whole(name: str, value: Any, at_least: int, at_most: int) -> int:

@@ -5,6 +5,8 @@ import errno
 import logging
 import socket
 import tempfile
+import threading
+import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,6 +49,7 @@ def serve(
     port: int = 8000,
     device: str = "",
     limits: Limits | None = None,
+    opens: bool = False,
 ) -> None:
     """Serve a page to generate, complete, compare and save scans, until Ctrl-C.
 
@@ -56,6 +59,7 @@ def serve(
         host: address to listen at; a loopback one keeps the page to this machine.
         port: port to listen at; 0 for any that is free.
         limits: bounds on what clients may ask for.
+        opens: whether to open the page in this machine's browser.
     """
     with open_server(runs, host, port, device, limits) as server:
         name = socket.gethostname() if host in ALL_ADDRESSES else host
@@ -66,6 +70,8 @@ def serve(
         more = " (where this name is not known, at this machine's numeric address)" if host in ALL_ADDRESSES else ""
         url = f"http://[{name}]:{server.port}" if ":" in name else f"http://{name}:{server.port}"
         say(f"open {url} in a browser{more}; Ctrl-C ends it")
+        if opens:  # in a thread: a browser in the terminal ends only when somebody quits it
+            threading.Thread(target=_open_page, args=(url, say), daemon=True).start()
         server.run()
 
 
@@ -115,6 +121,11 @@ def open_server(
         finally:
             server.task_dispatcher.shutdown()
             close_all()
+
+
+def _open_page(url: str, say: Callable[[str], None]) -> None:
+    if not webbrowser.open(url):
+        say(f"no browser was found on this machine: open {url} yourself")
 
 
 def finished_runs(folder: Path, say: Callable[[str], object]) -> list[Path]:

@@ -32,14 +32,18 @@ from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.projection.sensor_check import has_few_rings, ring_count
-from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
+from lidargrit.simulator import simulate
+from lidargrit.simulator.power import RaydropModel
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
-from lidargrit.viewer.serve.requests import TASKS, UPSAMPLED, SampleRequest, sampling_settings
+from lidargrit.viewer.serve.requests import EXAMPLES, TASKS, UPSAMPLED, Example, SampleRequest, sampling_settings
 
 PAGE_FILE, PIXELS_FILE = "page.json", "pixels.npz"  # of a result: for the page, and for files to save
 _NOT_ON_THE_PAGE = ("lidargrit ", "--", "data.", "sensor")  # words of cures that the page does not offer
+_EXAMPLE_SEED = 2_000_003  # a test street: no packaged model learned from it
+_NO_POWER = 1e-12  # all but nothing: every beam that meets something is detected
 NO_ROOM = OutputError(
     "no room on the server's disk for this scan", "some free space in its temporary folder", "try again later"
 )
@@ -121,22 +125,23 @@ def _settings_of(generator: Generator) -> list[dict[str, Any]]:
 
 
 def compute_result(generator: Generator, request: SampleRequest, variant: ProjectionVariant = "exact") -> list[ScanSet]:
-    """Sample new scans, or complete, upsample, drop or reconstruct an uploaded scan.
+    """Sample new scans, or complete, upsample, drop or reconstruct a scan that is uploaded or an example.
 
     Args:
         request: task and settings that the page sent.
         variant: variant of the projection that the model learned from.
     """
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
-    own = generator.completion_sampling() if request.file else generator.Sampling()
+    own = generator.completion_sampling() if request.has_scan else generator.Sampling()
     sampling = dataclasses.replace(own, **request.sampling) if request.sampling else None
     seeds = range(request.seed, request.seed + request.count)
-    if not request.file:
+    if not request.has_scan:
         names = tuple(f"seed {seed}" for seed in seeds)
         return [ScanSet("generated", generator.sample(seeds, sampling=sampling).to("cpu"), names)]
-    seen = _read_upload(request, generator, _reader(request, generator, variant))
+    seen = _read_scan(request, generator, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
-    sets = [ScanSet("as uploaded", image, (request.name,))]
+    measured = torch.zeros_like(image.return_mask)  # nothing in it was filled
+    sets = [ScanSet("example" if request.example else "as uploaded", image, (request.name,), filled=measured)]
     if "complete" not in generator.capabilities:
         return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
     if request.task == "region" and not request.region:
@@ -145,12 +150,14 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     images = RangeImage.stack([image[0]] * request.count)
     if request.task == "raydrop":
         dropped = generator.complete(Observed.of_surfaces(images), seeds, sampling)
-        return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names)]
+        nothing = torch.zeros_like(dropped.return_mask, device="cpu")
+        return [*sets, ScanSet("with raydrop", dropped.to("cpu"), names, filled=nothing)]
     observed = _observed(request, seen)
     condition = Observed.of_pixels(images, observed.expand_as(images.return_mask))
     if bool((images[0].return_mask & ~observed).any()):
-        sets.append(ScanSet("what the model saw", condition[0:1].images, (request.name,)))
-    return [*sets, ScanSet("completed", generator.complete(condition, seeds, sampling).to("cpu"), names)]
+        sets.append(ScanSet("what the model saw", condition[0:1].images, (request.name,), filled=measured))
+    completed = generator.complete(condition, seeds, sampling).to("cpu")
+    return [*sets, ScanSet("completed", completed, names, filled=completed.return_mask & ~observed)]
 
 
 def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVariant) -> ScanReader:
@@ -161,8 +168,10 @@ def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVar
     return ScanReader(generator.sensor, variant, partial=completes and request.task == "returns")
 
 
-def _read_upload(request: SampleRequest, generator: Generator, reader: ScanReader) -> InputScan:
-    """Read and project an uploaded file; messages give its name on the client's side, not its path on the server."""
+def _read_scan(request: SampleRequest, generator: Generator, reader: ScanReader) -> InputScan:
+    """Simulate an example, or read an uploaded file, and project it; messages name no path on the server."""
+    if request.example:
+        return reader.read(_example(EXAMPLES[request.example], generator.sensor))
     path = Path(request.file)
     try:
         scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
@@ -175,6 +184,12 @@ def _read_upload(request: SampleRequest, generator: Generator, reader: ScanReade
         if not any(words in error.cure for words in _NOT_ON_THE_PAGE):
             raise
         raise type(error)(error.got, error.wanted, _cure_on_the_page(request, generator, scan)) from None
+
+
+def _example(example: Example, sensor: SensorModel) -> Scan:
+    sensor = load_sensor(example.sensor) if example.sensor else sensor
+    beams = RaydropModel(least_power=_NO_POWER, gap_share=0.0) if example.every_beam_returns else RaydropModel()
+    return simulate(_EXAMPLE_SEED, sensor, model=beams)
 
 
 def _cure_on_the_page(request: SampleRequest, generator: Generator, scan: Scan) -> str:

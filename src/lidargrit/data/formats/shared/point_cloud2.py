@@ -20,6 +20,8 @@ def columns_of_cloud(cloud: Any) -> tuple[dict[str, np.ndarray], tuple[str, ...]
     """
     notes, fields = [], {}
     size = int(cloud.point_step)
+    if not int(cloud.width) * int(cloud.height):  # some drivers send a first cloud without fields, too
+        return {axis: np.empty(0, np.float32) for axis in "xyz"}, ()
     for each in cloud.fields:
         if each.count > 1 or each.datatype not in _NUMBERS or each.name in fields:
             continue

@@ -2,6 +2,7 @@
 
 const PANES_AT_MOST = 4; // more are too small to see anything in
 const ASK_AGAIN_MS = 300;
+const TURN_A_FRAME = 0.004; // a turn in half a minute
 const el = (id) => document.getElementById(id);
 
 // A pane whose files the server writes, by the same code as `lidargrit export`.
@@ -86,11 +87,64 @@ class Desk {
     el("count").max = String(limits.scans);
     el("model").addEventListener("change", () => this.offer());
     el("request").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
-    el("own").addEventListener("submit", (event) => this.submit(event, () => this.complete()));
-    el("task").addEventListener("change", () => this.chooseRegion(null));
-    el("file").addEventListener("change", () => this.chooseRegion(null));
+    el("own").addEventListener("submit", (event) => this.workOn(event.submitter.value));
+    el("own").addEventListener("submit", (event) => event.preventDefault());
+    el("file").addEventListener("change", () => this.chooseExample(""));
+    for (const button of el("examples").children) {
+      button.addEventListener("click", () => {
+        this.chooseExample(button.dataset.example);
+        this.workOn(button.dataset.task);
+      });
+    }
+    this.example = "";
+    this.task = "";
     this.region = null;
     this.offer();
+  }
+
+  // The page begins with a scan that turns, until somebody takes hold of it.
+  async begin() {
+    el("count").value = "1";
+    await this.submit(null, () => this.generate());
+    el("count").value = "3";
+    if (this.page && !window.matchMedia("(prefers-reduced-motion: reduce)").matches) {
+      this.turn();
+    }
+  }
+
+  turn() {
+    let turning = true;
+    for (const kind of ["pointerdown", "keydown", "wheel"]) {
+      window.addEventListener(kind, () => (turning = false), { once: true, capture: true });
+    }
+    const next = () => {
+      if (turning && this.page.panes.length > 0) {
+        this.page.camera.orbit(TURN_A_FRAME, 0);
+        this.page.redraw();
+        requestAnimationFrame(next);
+      }
+    };
+    requestAnimationFrame(next);
+  }
+
+  chooseExample(name) {
+    this.example = name;
+    if (name) {
+      el("file").value = "";
+    }
+    for (const button of el("examples").children) {
+      button.setAttribute("aria-pressed", String(button.dataset.example === name));
+    }
+    this.chooseRegion(null);
+  }
+
+  // Another task than before begins without the region that was drawn for it.
+  workOn(task) {
+    if (task !== this.task) {
+      this.task = task;
+      this.chooseRegion(null);
+    }
+    return this.submit(null, () => this.complete());
   }
 
   get model() {
@@ -105,17 +159,17 @@ class Desk {
     el("first").replaceChildren(...(first ? [first] : []));
     el("settings").replaceChildren(...others);
     el("more").hidden = others.length === 0;
-    el("tasks").hidden = upload !== "complete";
-    for (const option of el("task").options) {
-      option.hidden = option.disabled = !tasks.includes(option.value);
+    this.buttonWords ??= Object.fromEntries([...el("tasks").children].map((one) => [one.value, one.textContent]));
+    for (const button of el("tasks").children) {
+      button.hidden = upload === "complete" ? !tasks.includes(button.value) : upload === "" || button.value !== "ahead";
+      button.textContent = upload === "encode" ? "Reconstruct it" : this.buttonWords[button.value];
     }
-    if (el("task").selectedOptions[0]?.disabled) {
-      el("task").value = "returns";
+    for (const button of el("examples").children) {
+      button.hidden = upload === "complete" ? !tasks.includes(button.dataset.task) : upload === "" || button.dataset.example !== "street";
     }
-    el("complete").textContent = upload === "encode" ? "Reconstruct it" : "Do it";
     el("file").disabled = upload === "";
     el("ability").textContent = {
-      complete: "The model generates what the task says; all else stays as it is.",
+      complete: "All else stays as it is. Measured points are grey, filled ones have a colour.",
       encode: "The model encodes the scan as tokens and decodes a scan from them: you see what the tokens keep.",
     }[upload] ?? `A ${generator} model can neither complete nor reconstruct scans.`;
     this.enable();
@@ -123,7 +177,7 @@ class Desk {
 
   // Whether dragging over a range image draws a region.
   get draws() {
-    return this.model.upload === "complete" && el("task").value === "region";
+    return this.model.upload === "complete" && this.task === "region";
   }
 
   chooseRegion(region) {
@@ -132,8 +186,9 @@ class Desk {
   }
 
   enable() {
-    el("generate").disabled = Boolean(this.busy);
-    el("complete").disabled = Boolean(this.busy) || this.model.upload === "";
+    for (const button of [el("generate"), ...el("tasks").children, ...el("examples").children]) {
+      button.disabled = Boolean(this.busy);
+    }
   }
 
   // The settings that the user typed. The generator chooses the others: it may complete by other values than it
@@ -151,12 +206,18 @@ class Desk {
 
   async complete() {
     const [file] = el("file").files;
-    if (file.size > this.limits.uploadBytes) {
-      throw new Error(`The file has ${file.size.toLocaleString("en")} bytes; at most ${this.limits.uploadBytes.toLocaleString("en")} are taken.`);
-    }
-    const request = { ...this.request(), name: file.name, task: el("task").value };
+    const request = { ...this.request(), task: this.task };
     if (this.draws && this.region) {
       request.region = this.region.map((share) => Number(share.toFixed(4)));
+    }
+    if (this.example) {
+      return this.send({ ...request, example: this.example }, "");
+    }
+    if (!file) {
+      throw new Error("Choose a file, or an example, first.");
+    }
+    if (file.size > this.limits.uploadBytes) {
+      throw new Error(`The file has ${file.size.toLocaleString("en")} bytes; at most ${this.limits.uploadBytes.toLocaleString("en")} are taken.`);
     }
     let body;
     try {
@@ -164,11 +225,15 @@ class Desk {
     } catch {
       throw new Error(`${file.name} has changed since you chose it, or can no longer be read. Choose it again.`);
     }
+    return this.send({ ...request, name: file.name }, body);
+  }
+
+  send(request, body) {
     return asked(`/complete?request=${encodeURIComponent(JSON.stringify(request))}`, { method: "POST", body });
   }
 
   async submit(event, begin) {
-    event.preventDefault();
+    event?.preventDefault();
     this.busy = true;
     this.enable();
     const touched = Object.entries(this.request().sampling).map(([name, value]) => `${name}=${value}`);
@@ -179,7 +244,7 @@ class Desk {
       const data = await (await asked(`/jobs/${job}/scans`)).json();
       await this.show(data, job, by);
       const draw = this.draws && !this.region && data.sources.length === 1;
-      el("status").textContent = draw ? "Now drag over the part of the range image that is to be filled in, and press the button again." : `Done in ${seconds} s.`;
+      el("status").textContent = draw ? "Now drag over the part of the range image that is to be filled in, and press the same button again." : `Done in ${seconds} s.`;
     });
     this.busy = false;
     this.enable();
@@ -226,6 +291,7 @@ class Desk {
       return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, data.scales);
     });
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
+    fresh.at(-1).element.scrollIntoView({ block: "nearest" }); // on a small screen the form lies below
   }
 
   async remove(pane) {
@@ -267,6 +333,7 @@ asked("/models")
   .then((answer) => answer.json())
   .then((data) => {
     desk = new Desk(data);
+    return desk.begin();
   })
   .catch((error) => {
     el("error").textContent = error.message;
