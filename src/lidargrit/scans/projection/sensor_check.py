@@ -162,7 +162,8 @@ def told_doubts(scan: Scan, sensor: SensorModel, method: ProjectionName, source:
         a sentence each, "" where there is no such sign.
     """
     if not (doubt := told_height(scan, sensor)) and (about := doubts_about_rays(scan, sensor, method)):
-        doubt = f"{source or scan.source}, imaged as {sensor.name}: {about}; {_NAME_IT}, or take a model of it, {FIT_SENSOR}"
+        cure = f"{_NAME_IT}, or take a model of it, {FIT_SENSOR}"
+        doubt = f"{source or scan.source}, imaged as {sensor.name}: {about}; {cure}"
     return doubt, told_revolutions(scan)
 
 
