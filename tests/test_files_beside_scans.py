@@ -77,7 +77,6 @@ CURES = {
     "a.laz": "unpack it to .las",
     "a.bin.gz": "unpack it first",
     "a.mcap.zstd": "unpack it with: zstd -d",
-    "a.h5": "lidargrit.Scan.from_points",
     "a.e57": "convert it to .pcd or .ply",
     "a.bag.active": "rosbag reindex",
 }

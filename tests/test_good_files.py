@@ -168,8 +168,25 @@ def test_arrays_by_name_by_column_and_organised(tmp_path):
     for name, array in arrays.items():
         np.savez(tmp_path / f"{name}.npz", array)
         check(tmp_path / f"{name}.npz")
-    np.savez(tmp_path / "a.npz", points=bare[:, :3], reflectance=bare[:, 3:])
-    check(tmp_path / "a.npz")
+    named = {"axes": dict(zip(("x", "Y", "z"), bare.T[:3], strict=True)), "cloud": {"pc": bare[:, :3]}}
+    for name, points in {"a": {"points": bare[:, :3]}, **named}.items():
+        np.savez(tmp_path / f"{name}.npz", **points, reflectance=bare[:, 3:])
+        check(tmp_path / f"{name}.npz")
+        assert open_source(str(tmp_path / f"{name}.npz")).kind == "scans"
+
+
+@pytest.mark.parametrize(
+    ("arrays", "cure"),
+    [
+        ({"pc": ROWS["x"], "more": ROWS["y"]}, "call the array of points 'points'"),
+        ({"points": ROWS["x"]}, r"shape it into rows, such as array.view\(np.float32\).reshape\(-1, 4\)"),
+        ({"points": np.zeros((POINTS, 6))}, "keep x, y, z, intensity, ring of each point"),
+    ],
+)
+def test_other_arrays_are_refused_with_what_to_do(tmp_path, arrays, cure):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(ScanError, match=cure):
+        read_scan(tmp_path / "a.npz")
 
 
 def test_a_fourth_column_of_rings_is_no_reflectance(tmp_path):

@@ -3,6 +3,7 @@
 import io
 import os
 import sys
+import time
 from contextlib import suppress
 from contextvars import copy_context
 from functools import partial
@@ -94,6 +95,26 @@ def test_interrupted_stages_keep_the_time_that_they_took(tmp_path):
     with _Clock(path).stage("sample"):  # the same command again
         pass
     assert read_json(path) == {"sample": 41.0}
+
+
+def test_silence_is_broken_by_a_line_and_only_silence(monkeypatch, capsys):
+    monkeypatch.setattr(reporting, "_SILENT_AT_FIRST_S", 0.1)
+    monkeypatch.setattr(reporting, "_SILENT_S_AT_MOST", reporting._MARGIN_S + 0.4)
+    reporter, text = reporter_on(100, is_terminal=False)
+    with reporter.never_silent("lidargrit train"):
+        time.sleep(0.9)
+    assert capsys.readouterr().err == "lidargrit train loads its libraries\n"
+    lines = text.getvalue().splitlines()
+    assert lines[0].startswith("lidargrit train is still at work, begun 0:0")
+    assert len(lines) == 1
+    time.sleep(0.5)
+    assert len(text.getvalue().splitlines()) == 1, "after its end"
+    with reporter.never_silent("lidargrit train"):
+        for _ in range(20):
+            reporter.message("something")
+            time.sleep(0.01)
+    assert len(text.getvalue().splitlines()) == 21
+    assert capsys.readouterr().err == ""
 
 
 def test_a_reader_that_has_gone_ends_no_work(monkeypatch):

@@ -6,7 +6,7 @@ import importlib
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
@@ -33,14 +33,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one verb; 0 = done, 2 = the user's mistake, printed in one line, 130 = interrupted, 143 = terminated."""
     try:
         with raising_on_signals():
-            return _run([*(sys.argv[1:] if arguments is None else arguments)])  # list() here is our own verb
+            if arguments is None:
+                return _run(sys.argv[1:], is_program=True)
+            return _run([*arguments])  # list() here is our own verb
     except Terminated:  # before the command was read
         return 143
     except KeyboardInterrupt:
         return 130
 
 
-def _run(words: list[str]) -> int:
+def _run(words: list[str], is_program: bool = False) -> int:
     _let_threads_sleep()
     parser = build_parser()
     try:
@@ -53,7 +55,10 @@ def _run(words: list[str]) -> int:
         told = script(parser, options.print_completion) if options.print_completion else parser.format_help()
         options.run = lambda _: print(told)
     try:
-        with _refusing_unusable_paths(), reporting.to(reporting.TerminalReporter()):
+        reporter = reporting.TerminalReporter()
+        tells = is_program and options.verb and not options.waits and os.environ.get("RANK", "0") == "0"
+        aloud = reporter.never_silent(f"lidargrit {options.verb}") if tells else nullcontext()
+        with _refusing_unusable_paths(), reporting.to(reporter), aloud:
             options.run(options)
             if sys.stdout is not None:  # closed by the caller
                 sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
@@ -112,7 +117,8 @@ def build_parser() -> Parser:
             **raw,
         )
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
-        sub.set_defaults(goes_on=False)  # a verb that keeps what it has done, and goes on there, says so itself
+        # A verb that keeps what it has done, and goes on there, says so itself, and so does one that waits for others.
+        sub.set_defaults(goes_on=False, waits=False)
         verb.add_arguments(sub)
         sub.set_defaults(run=verb.run, words=sub)
         sub.usage = sub.short_usage()

@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--open", action="store_true", help="open the page in this machine's browser, too")
     parser.add_argument("--seconds", type=float, default=120.0, help="time limit of one request, in seconds")
     add_device(parser)
+    parser.set_defaults(waits=True)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@ Whoever works reports by :func:`message` and :func:`progress`; whoever wants to 
 """
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _SILENT_S_AT_MOST = 10.0  # between two lines of one piece of work, where there is no terminal
+_SILENT_AT_FIRST_S = 1.2  # while libraries are loaded, which takes some seconds
+_MARGIN_S = 1.0  # by which a line about silence comes before it is too long
 _PRIOR_S = 10.0  # of expected work that counts as having taken as long as expected, so that first seconds mislead less
 _NOTE_COLUMNS = 110  # of a terminal; narrower ones show no note behind the bar
 _BAR_COLUMNS = 10, 40  # fewest and most columns of a bar
@@ -134,6 +137,31 @@ class TerminalReporter(Reporter):
 
     def __init__(self) -> None:
         self._schedule = Schedule({})
+        self._said_s = time.monotonic()
+
+    @contextmanager
+    def never_silent(self, command: str) -> Iterator[None]:
+        """Say within the block that work goes on, wherever nothing else is said for ten seconds, or two at first."""
+        ended, begun_s = threading.Event(), time.monotonic()
+        self._said_s = begun_s
+
+        def watch() -> None:
+            if not ended.wait(_SILENT_AT_FIRST_S) and self._said_s == begun_s and sys.stderr is not None:
+                self._note_said()
+                with suppress(OSError):  # not by rich, which has yet to be loaded itself
+                    print(f"{command} loads its libraries", file=sys.stderr, flush=True)
+            at_most_s = _SILENT_S_AT_MOST - _MARGIN_S
+            while not ended.wait(max(0.0, self._said_s + at_most_s - time.monotonic())):
+                if time.monotonic() - self._said_s >= at_most_s:
+                    self.message(f"{command} is still at work, begun {_minutes(time.monotonic() - begun_s)} ago")
+
+        thread = threading.Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
     @cached_property
     def _console(self) -> "Console":
@@ -149,6 +177,7 @@ class TerminalReporter(Reporter):
 
     def message(self, text: str) -> None:
         """Say one line."""
+        self._note_said()
         with suppress(OSError):  # a full disk: what is worked on matters more
             self._console.print(text, markup=False, soft_wrap=True)
 
@@ -174,7 +203,10 @@ class TerminalReporter(Reporter):
         ]
         with bars.Progress(*columns, console=self._console, speed_estimate_period=60) as display:
             task = display.add_task(what, total=total, completed=done, words="")
-            yield _Bar(display, task, self._schedule, self._console.width >= _NOTE_COLUMNS)
+            yield _Bar(display, task, self._schedule, self._console.width >= _NOTE_COLUMNS, self._note_said)
+
+    def _note_said(self) -> None:
+        self._said_s = time.monotonic()
 
     def of_process(self, name: str) -> Reporter:
         """Return a reporter without bars, which would overwrite those of other processes."""
@@ -195,10 +227,14 @@ class _LineReporter(Reporter):
 
 
 class _Bar(Progress):
-    def __init__(self, display: Any, task: Any, schedule: Schedule, shows_note: bool) -> None:
+    def __init__(
+        self, display: Any, task: Any, schedule: Schedule, shows_note: bool, note_said: Callable[[], None]
+    ) -> None:
         self._display, self._task, self._schedule, self._shows_note = display, task, schedule, shows_note
+        self._note_said = note_said
 
     def advance(self, amount: int, note: str = "") -> None:
+        self._note_said()
         self._display.update(self._task, advance=amount)
         task = self._display.tasks[self._task]
         self._schedule.advance(task.description, task.completed / max(task.total, 1))

@@ -30,10 +30,6 @@ _CURES = {  # by the ending, for files that hold scans but are not read
     (".zst", ".zstd"): "unpack it with: zstd -d",
     (".gz", ".bz2", ".xz", ".zip", ".7z"): "unpack it first",
     (".bag.active",): "finish it with: rosbag reindex",
-    (
-        ".h5",
-        ".hdf5",
-    ): "name its datasets in Python: lidargrit.Scan.from_points(file['points'][:], file['intensity'][:])",
     (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
 }
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
@@ -54,6 +50,8 @@ class ScanFormat(ABC):
     """The sensor that makes such files, if it is always the same."""
     several: ClassVar[bool] = False
     """Whether one file may hold more than one scan."""
+    topics: ClassVar[bool] = False
+    """Whether a user may choose by a name what is read of a file; then count and read take a ``topic``."""
     sensors: ClassVar[int] = 1
     """How many sensors a file has a scan of each; a set of scans is of the first, for the others have other rays."""
     keeps: ClassVar[tuple[str, ...]] = ()
@@ -104,8 +102,12 @@ class ScanFormat(ABC):
 
     @classmethod
     def of_topic(cls, topic: str) -> "type[ScanFormat]":
-        """Return the format that reads one topic of a recording; itself where files have no topics."""
-        return cls
+        """Return the format that reads one topic of a file, "" for what counts there; itself if files have none."""
+        if not (topic and cls.topics):
+            return cls
+        chosen = {name: functools.partial(getattr(cls, name), topic=topic) for name in ("count", "read")}
+        bound = {name: staticmethod(method) for name, method in chosen.items()}
+        return type(cls.__name__, (cls,), {**bound, "__module__": cls.__module__})
 
     @staticmethod
     def companions(path: Path) -> tuple[Path, ...]:

@@ -8,25 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array, read_member
+from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, damaged, first_bytes, open_file, read_bytes
+from lidargrit.data.formats import BadPoints, damaged, first_bytes, open_file, read_bytes
+from lidargrit.data.formats.shared.archive import ROWS, WIDTHS, are_points, columns_of_archive, columns_of_rows
 from lidargrit.data.formats.shared.carla import right_handed
 from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, ColumnFormat, scan_of_columns
 from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
-from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers or of named ones, or an .npz with an array points of n rows"
 _MAGIC = b"\x93NUMPY"  # of an array alone
-_VALUE_BYTES_AT_MOST = 16  # numpy's widest number
-_ROWS = ("x", "y", "z", "intensity", "ring")
-_WIDTHS = range(3, 6)
-_POINTS_FOR_RINGS, _RINGS_AT_MOST = 100, 256
-_WITHIN_RINGS = 0.05  # share of the elevations' variance; reflectance of whole numbers leaves nearly all of it
-_UNNAMED = "arr_0"  # as numpy calls an array that is saved without a name
-_POINTS = ("points", "xyz", "points_xyz_m")
 
 
 class NumpyArray(ColumnFormat):
@@ -34,9 +27,9 @@ class NumpyArray(ColumnFormat):
 
     An ``.npy`` holds a row of x, y, z for every point, and reflectance and ring if the rows are longer; a fourth number
     that keeps to one elevation is the ring. Rows of named numbers, organised clouds (H, W, 3) and arrays by column
-    (3, n) are taken, too. An ``.npz`` holds such rows as ``points`` (or xyz), or as its one array without a name, and
-    if they are there reflectance (or reflectivity, intensity, remission,
-    i), ring (or channel) and label as arrays of their own. The ``.npy`` of a scan with rings but without reflectance
+    (3, n) are taken, too. An ``.npz`` holds such rows as ``points`` (or xyz), as x, y and z, or as the one array whose
+    name is no column of points, and if they are there reflectance (or reflectivity, intensity, remission, i), ring (or
+    channel) and label as arrays of their own. The ``.npy`` of a scan with rings but without reflectance
     is given a reflectance of 0.
     """
 
@@ -50,8 +43,7 @@ class NumpyArray(ColumnFormat):
             return True
         try:
             with open_file(path, _FORMAT) as file, _archive(file, path) as archive:
-                names = set(archive.namelist())
-                return bool({f"{name}.npy" for name in _POINTS} & names) or names == {f"{_UNNAMED}.npy"}
+                return are_points([name.removesuffix(".npy") for name in archive.namelist()])
         except (ScanError, OSError):
             return False
 
@@ -65,15 +57,12 @@ class NumpyArray(ColumnFormat):
                 rows = parse_array(data, may_have_fields=True)
             except ValueError as error:
                 raise damaged(path, _FORMAT, error) from None
-            columns, names = _row_columns(rows, path), list(rows.dtype.names or ())
+            columns, names = columns_of_rows(rows, path, _FORMAT), list(rows.dtype.names or ())
             if (marks := read_marks(path, len(next(iter(columns.values()), ())))) is not None:
                 columns["filled"] = marks.numpy().astype(np.uint8)
         else:
             with _archive(BytesIO(data), path) as archive:
-                columns, names = (
-                    _archive_columns(archive, path),
-                    [one.removesuffix(".npy") for one in archive.namelist()],
-                )
+                columns, names = columns_of_archive(archive, path, _FORMAT)
         return right_handed(scan_of_columns(columns, path, bad_points, names, are_named=bool(names)), columns)
 
     @staticmethod
@@ -93,7 +82,7 @@ class NumpyArray(ColumnFormat):
             if "ring" in columns:
                 columns.setdefault("intensity", np.zeros(len(points), dtype=np.float32))
             write_marks(path, columns.get("filled"))
-            np.save(file, np.column_stack([points, *(columns[name] for name in _ROWS[3:] if name in columns)]))
+            np.save(file, np.column_stack([points, *(columns[name] for name in ROWS[3:] if name in columns)]))
 
 
 def holds_points(path: Path) -> bool:
@@ -108,75 +97,7 @@ def holds_points(path: Path) -> bool:
         return True
     if dtype.names:
         return {*"xyz"} <= {name.lower() for name in dtype.names}
-    return dtype.kind in "fiu" and len(shape) in (2, 3) and bool({shape[0], shape[-1]} & {*_WIDTHS})
-
-
-def _row_columns(rows: np.ndarray, path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of an array: rows of named numbers, or of 3 to 5; organised (H, W, 3), or by column (3, n)."""
-    if rows.size > len(_ROWS) * POINTS_AT_MOST:
-        raise _refused(f"an array of shape {rows.shape}", path)
-    if rows.dtype.names:
-        return {
-            name: np.ascontiguousarray(rows[name]).reshape(-1)
-            for name in rows.dtype.names
-            if not rows.dtype[name].shape
-        }
-    if rows.dtype.kind == "b":
-        raise _refused("truth values as points", path)
-    if rows.ndim == 2 and rows.shape[0] in _WIDTHS and rows.shape[1] not in _WIDTHS:
-        rows = rows.T
-    if rows.ndim not in (2, 3) or rows.shape[-1] not in _WIDTHS or rows[..., 0].size > POINTS_AT_MOST:
-        raise _refused(f"an array of shape {rows.shape}", path)
-    columns = rows.reshape(-1, rows.shape[-1]).T
-    names = ("x", "y", "z", "ring") if len(columns) == 4 and _are_rings(columns) else _ROWS
-    return dict(zip(names, columns, strict=False))
-
-
-def _are_rings(columns: np.ndarray) -> bool:
-    """Return whether a fourth column without a name numbers lasers: few whole numbers, each at one elevation."""
-    x, y, z, number = columns
-    if len(number) < _POINTS_FOR_RINGS or not np.isfinite(columns).all():
-        return False
-    values, of_point = np.unique(number, return_inverse=True)
-    if not (4 <= len(values) <= _RINGS_AT_MOST and values[0] >= 0 and values[-1] < _RINGS_AT_MOST):
-        return False
-    elevation = np.arctan2(z.astype(np.float64), np.hypot(x, y))
-    mean = np.bincount(of_point, elevation) / np.bincount(of_point)
-    return bool((values % 1 == 0).all()) and float(
-        np.square(elevation - mean[of_point]).mean()
-    ) < _WITHIN_RINGS * float(elevation.var())
-
-
-def _archive_columns(archive: zipfile.ZipFile, path: Path) -> dict[str, np.ndarray]:
-    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    points_name = next((name for name in _POINTS if name in members), None)
-    if list(members) == [_UNNAMED]:
-        points_name = _UNNAMED
-    if points_name is None and "range_m" in members:
-        raise ScanError(
-            f"{path}, a range image from a folder of samples",
-            _FORMAT,
-            f"name the whole folder: {path.absolute().parent}",
-        )
-    if points_name is None:
-        raise _refused(f"the arrays {', '.join(map(ascii, list(members)[:8]))[:120]}", path)
-    rows = read_member(archive, members.pop(points_name), BYTES_AT_MOST, may_have_fields=True)
-    columns = _row_columns(rows, path)
-    count = len(next(iter(columns.values()), ()))
-    at_most = _VALUE_BYTES_AT_MOST * count + HEADER_BYTES_AT_MOST
-    for member, info in members.items():
-        name = known_name(member)
-        # What else is in the archive is not unpacked, nor the same name again: with other capitals there are hundreds.
-        if not name or name in columns:
-            continue
-        columns[name] = read_member(archive, info, at_most)
-        if columns[name].dtype.kind == "b":
-            raise _refused(f"truth values as {name}", path)
-        if columns[name].size == count:  # such as (n, 1), or organised as the points are
-            columns[name] = columns[name].reshape(-1)
-        if columns[name].shape != (count,):
-            raise _refused(f"{count} points, but {name} of shape {columns[name].shape}", path)
-    return columns
+    return dtype.kind in "fiu" and len(shape) in (2, 3) and bool({shape[0], shape[-1]} & {*WIDTHS})
 
 
 @contextmanager
@@ -189,7 +110,3 @@ def _archive(file: BytesIO | BufferedReader, path: Path) -> Iterator[zipfile.Zip
         raise
     except ValueError as error:
         raise damaged(path, _FORMAT, error) from None
-
-
-def _refused(what: str, path: Path) -> ScanError:
-    return ScanError(f"{path}, which holds {what}", _FORMAT, "save the points anew, or remove the file")

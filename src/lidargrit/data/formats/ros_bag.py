@@ -51,19 +51,13 @@ class RosBag(ScanFormat):
     suffixes = (".bag", ".mcap", ".db3")
     reflectance = REFLECTANCE_RULE
     several = True
+    topics = True
     extra = "ros"
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether a file begins as a recording."""
         return first_bytes(path, 16).startswith(tuple(_MAGIC.values()))
-
-    @classmethod
-    def of_topic(cls, topic: str) -> "type[RosBag]":
-        """Return the format of the clouds of one topic."""
-        methods = {"count": cls.count, "read": cls.read} if topic else {}
-        bound = {name: staticmethod(functools.partial(method, topic=topic)) for name, method in methods.items()}
-        return type(cls.__name__, (cls,), {**bound, "__module__": cls.__module__})
 
     @staticmethod
     def count(path: Path, topic: str = "") -> int:
