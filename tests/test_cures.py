@@ -124,3 +124,20 @@ def test_every_option_that_a_message_names_is_taken(verb, scans, tmp_path, capsy
                 tried = main([*words_of(verb, scans / fault, tmp_path / f"{fault}_{cure}"), *cure.split()])
                 assert tried == 0 or message not in capsys.readouterr().err, f"{verb} of {fault} with {cure}"
     assert refused, "no message at all"
+
+
+@pytest.mark.parametrize("verb", ["complete", "compress", "likelihood", "raydrop", "segment"])
+def test_a_run_refuses_another_sensor_and_other_columns_with_a_cure_that_works(verb, scans, tmp_path, capsys):
+    words = words_of(verb, scans / "few_rings", tmp_path)
+    if verb == "complete":
+        words[words.index("linear")] = "pretrained"
+    assert main([*words, "-n", "1", "--set", "data.columns=512"]) == 2
+    assert "64x512, for --model pretrained" in capsys.readouterr().err
+    assert main([*words, "-n", "1", "--sensor", "vlp16"]) == 2
+    message = capsys.readouterr().err
+    cure = re.search(r"first: lidargrit (rescan SCANS SEEN --sensor vlp16 --to hdl64e_kitti_odometry)", message)
+    assert cure, message
+    seen = str(tmp_path / "seen")
+    typed = cure[1].replace("SCANS", str(scans / "few_rings")).replace("SEEN", seen)
+    assert main(typed.split()) == 0
+    assert main([word.replace(str(scans / "few_rings"), seen) for word in (*words, "-n", "1")]) == 0

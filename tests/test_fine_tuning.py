@@ -9,6 +9,7 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.export import export_scans
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.training.fine_tuning import columns_like, fine_tuning_preset
 
 FEW = [
@@ -36,10 +37,17 @@ def test_scans_seen_grow_with_the_scans_that_there_are_and_some_are_held_out(sca
 
 def test_images_of_another_sensor_of_64_rows_are_as_wide_as_the_models():
     own = lidargrit.load("pretrained").sensor
-    assert columns_like(own, lidargrit.load_sensor("os1_64")) == (1024, 4)
-    assert columns_like(own, lidargrit.load_sensor("pandar64"))[0] % own.width == 0
-    with pytest.raises(ConfigError, match="scans of 16 rows"):
-        fine_tuning_preset("simulated:8:train", "vlp16")
+    assert columns_like(own, load_sensor("os1_64")) == (1024, 4)
+    assert columns_like(own, load_sensor("pandar64"))[0] % own.width == 0
+
+
+@pytest.mark.parametrize("sensor", ["vlp16", "hdl32e", "os1_128"])
+def test_scans_of_other_rows_are_refused_with_a_command_that_plans_a_training(sensor, capsys):
+    with pytest.raises(ConfigError, match=f"scans of {load_sensor(sensor).height} rows") as refused:
+        fine_tuning_preset("simulated:8:train", sensor)
+    typed = refused.value.cure.partition("lidargrit ")[2].split()
+    assert main([*typed, "--dry-run"]) == 0, capsys.readouterr().err
+    assert f"range images of {load_sensor(sensor).height}x256" in capsys.readouterr().out
 
 
 def test_the_verb_tells_the_time_trains_all_stages(scans, tmp_path, capsys):

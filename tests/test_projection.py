@@ -155,7 +155,7 @@ def test_a_sensor_that_does_not_fit_is_told_with_those_that_would():
     with pytest.raises(ScanError, match=r"\d+ rings"):
         project(scan, load_sensor("hdl64e_kitti_odometry"))
     velodyne = simulate(seed=0, sensor=load_sensor("hdl64e_kitti_360").with_columns(200))
-    with pytest.raises(ScanError, match=r"take a model of it \(hdl64e_kitti_360 or hdl64e_kitti_odometry, or find"):
+    with pytest.raises(ScanError, match=r"with --sensor \(hdl64e_kitti_360 or hdl64e_kitti_odometry, or find"):
         project(velodyne, load_sensor("vlp16"), "spherical")
 
 

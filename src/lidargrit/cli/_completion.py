@@ -10,6 +10,7 @@ from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, whole_number
 
 if TYPE_CHECKING:
+    from lidargrit.data.run_folder import Job
     from lidargrit.inference.complete import Model
     from lidargrit.inference.complete.command import Written
     from lidargrit.inference.complete.tasks import Task
@@ -51,13 +52,18 @@ def open_model_for(options: argparse.Namespace, task: "Task", sensor: "SensorMod
     return replace(model, projection=scan_settings(options).data.projection)
 
 
-def named_sensor(options: argparse.Namespace, is_needed: bool) -> "SensorModel | None":
-    """Return the sensor that the user named, else where one is needed that of the source, which is told if guessed."""
+def named_sensor(options: argparse.Namespace, is_needed: bool, job: "Job" = "complete") -> "SensorModel | None":
+    """Return the sensor that the user named, else that of the source, which is told if guessed.
+
+    Args:
+        is_needed: whether the model has no sensor of its own; a run has, which does ``job``, and refuses another.
+    """
     from lidargrit.data.sources import open_source
-    from lidargrit.data.sources.scan_sensor import sensor_for
+    from lidargrit.data.sources.scan_sensor import refuse_other_sensor, sensor_for
 
     settings = scan_settings(options)
-    if not (settings.sensor or is_needed):
+    if not is_needed:
+        refuse_other_sensor(settings, options.model, job)
         return None
     source = open_source(options.scans, settings.data.bad_points)
     return settings.data.imaged(sensor_for(source, settings.sensor))

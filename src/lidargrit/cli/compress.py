@@ -35,7 +35,7 @@ def run(options: argparse.Namespace) -> None:
     refuse_to_overwrite(options.out, options.overwrite, ".lgz")
     named = (options.scans, options.out, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
-    refuse_other_sensor(settings.sensor, options.model)
+    refuse_other_sensor(settings, options.model)
     found = compress_scans(*named, settings.data)
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
     print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

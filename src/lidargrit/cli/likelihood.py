@@ -42,5 +42,5 @@ def run(options: argparse.Namespace) -> None:
         refuse_to_overwrite(options.map, options.overwrite, ".npy")
     named = (options.scans, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
-    refuse_other_sensor(settings.sensor, options.model)
+    refuse_other_sensor(settings, options.model)
     print_result(options, *measure_source(*named, settings.data, options.map, options.device))

@@ -23,4 +23,4 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.inference.complete.tasks import Drop
 
     task = Drop()
-    run_task(options, open_model_for(options, task, named_sensor(options, is_needed=False)), task, options.probability)
+    run_task(options, open_model_for(options, task, named_sensor(options, False, "raydrop")), task, options.probability)

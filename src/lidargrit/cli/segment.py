@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
     refuse_taken(options)
     named = (options.scans, options.out, options.model)
     settings = scan_settings(options, max_scans=options.count)
-    refuse_other_sensor(settings.sensor, options.model, "segment")
+    refuse_other_sensor(settings, options.model, "segment")
     count, scores = segment_scans(*named, settings.data, options.device, options.compare)
     found = scores.as_json() if scores else {}
     done = f"done: {counted_scans(count, 'labelled')} in {options.out}; see them with: lidargrit view {options.out}"

@@ -67,13 +67,15 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
     """
     config = divided(data)
     own, made_by = load(PRETRAINED).sensor, load_sensor(sensor or config.sensor)
+    columns, stride = columns_like(own, made_by)
     if made_by.height != own.height:
+        of = f"data.sensor={sensor or config.sensor} data.columns={columns} data.column_stride={stride}"
         raise ConfigError(
             f"scans of {made_by.height} rows, of the sensor {made_by.name!r}",
-            f"{own.height} rows, those of the networks in the package",
-            "train networks for them: lidargrit train lidargrit_compact_pixels OUT --set data.sensor=...",
+            f"{own.height} rows: the networks of the package have weights for every row",
+            f"train new ones: lidargrit train lidargrit_small OUT --set {of} data.train={config.train[0]} "
+            f"data.val={config.val[0]}",
         )
-    columns, stride = columns_like(own, made_by)
     config = replace(config, sensor=sensor or config.sensor, columns=columns, column_stride=stride)
     preset = replace(load_preset(_PRESET), title="networks of the package, trained further", data=config)
     count = sum(len(open_source(source).scans()) for source in config.train)

@@ -1,7 +1,8 @@
 """Scans to turn, zoom and step through: range images → one HTML page that needs no network and no other file.
 
-The page holds ranges in 16 bits and the rays of each sensor once; the browser computes the points from them. Scripts
-and style sheet are the files in ``browser/``.
+The page holds ranges in 16 bits and the rays of each sensor once; the browser computes the points from them. Points of
+a cloud that have no pixel in its image follow with their coordinates. Scripts and style sheet are the files in
+``browser/``.
 """
 
 import base64
@@ -11,16 +12,19 @@ import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from matplotlib import colormaps
+from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import write_text
 from lidargrit.core.version import __version__
-from lidargrit.scans.classes import names_and_colours
+from lidargrit.scans.classes import CLASS_BITS, names_and_colours
 from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.types import Scan
 from lidargrit.viewer._page import document
 from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
 
@@ -142,27 +146,31 @@ def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
 
 
 def _source(scan_set: ScanSet) -> dict[str, Any]:
-    """Return one set: its rays and its classes once, and the pixels of every scan."""
+    """Return one set: its rays and its classes once, and the points of every scan: pixels, then those without one."""
     images = scan_set.images.to("cpu")
     step_m = _far_m(scan_set) / _RANGE_STEPS
-    steps = (images.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * images.return_mask
-    reflectance, label = images.reflectance, images.label
-    numbers = [] if label is None else label[images.return_mask].unique().tolist()
-    if len(numbers) > _CLASSES_AT_MOST:
-        raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
+    numbers = _numbers_of_classes(scan_set)
     named = names_and_colours(numbers)
     scans: list[dict[str, Any]] = []
-    for index, name in enumerate(scan_set.scan_names):
-        scan = {"name": name, "range": _packed(steps[index].numpy().astype("<u2"))}
-        if reflectance is not None:
-            scan["reflectance"] = _packed((255 * reflectance[index].detach()).round().numpy().astype(np.uint8))
+    for index, (name, hidden) in enumerate(zip(scan_set.scan_names, scan_set.hidden(), strict=True)):
+        image = images[index]
+        beside = scan_set.beside[index] if scan_set.shows_beside and scan_set.beside else None
+        steps = (image.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * image.return_mask
+        scan = {"name": name, "range": _packed(steps.numpy().astype("<u2")), "hidden": hidden}
+        if beside is not None:
+            scan["beside"] = _packed(beside.points_xyz_m.numpy().astype("<f4"))
         if scan_set.surprise is not None:
             share = (scan_set.surprise[index] / SURPRISED_BITS).clamp(0, 1)
             scan["surprise"] = _packed((255 * share).round().numpy().astype(np.uint8))
+        if image.reflectance is not None:
+            of_all = _followed_by(image.reflectance.detach(), beside, "reflectance")
+            scan["reflectance"] = _packed((255 * of_all).round().astype(np.uint8))
         if scan_set.filled is not None:
-            scan["filled"] = _packed(scan_set.filled[index].numpy().astype(np.uint8))
-        if label is not None:
-            scan["label"] = _packed(np.searchsorted(numbers, label[index].numpy()).astype(np.uint8))
+            of_all = _followed_by(scan_set.filled[index], beside, "filled")
+            scan["filled"] = _packed(of_all.astype(np.uint8))
+        if image.label is not None:
+            of_all = _followed_by(image.label, beside, "label") & CLASS_BITS
+            scan["label"] = _packed(np.searchsorted(numbers, of_all).astype(np.uint8))
         scans.append(scan)
     return {
         "name": scan_set.name,
@@ -176,6 +184,29 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
         "classes": [{"number": number, "name": name, "colour": colour} for number, name, colour in named],
         "scans": scans,
     }
+
+
+def _followed_by(pixels: Tensor, beside: Scan | None, part: Literal["reflectance", "filled", "label"]) -> np.ndarray:
+    """Return the values of all pixels, then those of the points without one; 0 where these have none."""
+    values = pixels.numpy().ravel()
+    if beside is None:
+        return values
+    known = {"reflectance": beside.reflectance, "filled": beside.filled, "label": beside.label}[part]
+    more = np.zeros(len(beside)) if known is None else known.numpy()
+    return np.concatenate([values, more.astype(values.dtype)])
+
+
+def _numbers_of_classes(scan_set: ScanSet) -> list[int]:
+    """Return the number of each class of a set, in their order."""
+    label = scan_set.images.label
+    if label is None:
+        return []
+    found = [label[scan_set.images.return_mask].cpu().long()]
+    found += [one.label.long() & CLASS_BITS for one in scan_set.beside if one and one.label is not None]
+    numbers = torch.cat(found).unique().tolist()
+    if len(numbers) > _CLASSES_AT_MOST:
+        raise ConfigError(f"{len(numbers)} classes of labels", f"at most {_CLASSES_AT_MOST}", "show fewer scans")
+    return numbers
 
 
 def _far_m(scan_set: ScanSet) -> float:

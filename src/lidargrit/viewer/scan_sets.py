@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int32
 from torch import Tensor
 
 from lidargrit.core import reporting
@@ -15,7 +16,7 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.projection import ProjectionVariant, index_map, project
+from lidargrit.scans.projection import index_map, project
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
@@ -35,6 +36,8 @@ class ScanSet:
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
             if no model was asked.
         filled: True for pixels whose point a model filled in; None where no scan says so.
+        beside: points of each scan that have no pixel in its image, None for none; empty if the scans are no clouds.
+        shows_beside: whether a page shows these points, too, or only counts them.
     """
 
     name: str
@@ -42,6 +45,14 @@ class ScanSet:
     scan_names: tuple[str, ...]
     surprise: Float[Tensor, "B H W"] | None = None
     filled: Bool[Tensor, "B H W"] | None = None
+    beside: tuple[Scan | None, ...] = ()
+    shows_beside: bool = False
+
+    def hidden(self) -> list[int]:
+        """Return how many points of each scan are not shown."""
+        if self.shows_beside or not self.beside:
+            return [0] * len(self.scan_names)
+        return [0 if scan is None else len(scan) for scan in self.beside]
 
 
 def load_scan_sets(
@@ -66,8 +77,8 @@ def load_scan_sets(
         settings: sensor that scans are imaged with, and settings of reading them.
         sensor: sensor to project scans with if the settings name none; those of runs and samples keep theirs.
         all_columns: whether scans are shown with all columns that their sensor fires, up to 200,000 pixels; otherwise
-            with those that its image keeps. It has no effect if the settings give a number of columns, beside samples
-            and runs, nor with a ``sensor``.
+            with those that its image keeps. Then points without a pixel are shown as well. It has no effect if the
+            settings give a number of columns, beside samples and runs, nor with a ``sensor``.
     """
     settings = settings or ScanSettings()
     config = settings.data
@@ -88,7 +99,7 @@ def load_scan_sets(
             rays = _fine(named or config.imaged(source.sensor)) if fine else sensor
             how = (count, rays, config)
             read = _of_scans(source, *how) if isinstance(source, DatasetSource) else _of_images(source, *how)
-            sets.append(replace(read, name=_short(source.text)))
+            sets.append(replace(read, name=_short(source.text), shows_beside=fine))
     scans = sets[0] if sets else None
     for name, generator in generators.items():
         sets += _of_generator(name, generator, seeds, scans)
@@ -144,31 +155,34 @@ def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, con
     dataset, imaging = source.scans(), source.imaging(sensor, config)
     imaging.report()
     sensor, config = imaging.sensor, imaging.config
-    images, names, filled = [], [], []
+    images, names, filled, beside = [], [], [], []
     for index in evenly_spaced(count, len(dataset)):
         try:
             scan = dataset.scan(index)
-            images.append(project(scan, sensor, variant=config.projection_variant))
-            filled.append(_filled(scan, sensor, config.projection_variant))
+            image = project(scan, sensor, variant=config.projection_variant)
         except ScanError as error:
             if config.bad_scans == "refuse":
                 raise
             reporting.message(f"left out: {error}")
             continue
+        shown = index_map(scan, sensor, variant=config.projection_variant)[:, :: sensor.column_stride]
+        has_pixel = torch.zeros(len(scan), dtype=torch.bool)
+        has_pixel[torch.from_numpy(shown).long()[image.return_mask]] = True
+        images.append(image)
         names.append(dataset.name(index))
+        filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
+        beside.append(None if bool(has_pixel.all()) else replace(scan, rows=None).select(~has_pixel))
     if not images:
         raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
     known = any(one is not None for one in filled)
-    return ScanSet(source.text, RangeImage.stack(images), tuple(names), filled=marks if known else None)
+    stacked = RangeImage.stack(images)
+    return ScanSet(source.text, stacked, tuple(names), filled=marks if known else None, beside=tuple(beside))
 
 
-def _filled(scan: Scan, sensor: SensorModel, variant: ProjectionVariant) -> Bool[Tensor, "H W"] | None:
-    """Return in which pixels the point is one that a model filled in; None of a scan that does not say."""
-    if scan.filled is None:
-        return None
-    point = torch.from_numpy(index_map(scan, sensor, variant=variant)[:, :: sensor.column_stride]).long()
-    return torch.cat((scan.filled, torch.zeros(1, dtype=torch.bool)))[point]  # that of no point, -1, is the last
+def _of_pixels(marks: Bool[Tensor, "n"], point: Int32[np.ndarray, "H W"]) -> Bool[Tensor, "H W"]:
+    """Return the mark of each pixel's point; False where there is none, -1."""
+    return torch.cat((marks, torch.zeros(1, dtype=torch.bool)))[torch.from_numpy(point).long()]
 
 
 def _short(source: str) -> str:

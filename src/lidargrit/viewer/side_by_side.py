@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.generation.generator import Generator, load
@@ -15,7 +16,7 @@ from lidargrit.nn.devices import usable_device
 from lidargrit.scans.types import RangeImage
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
-from lidargrit.viewer.scan_sets import load_scan_sets
+from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
 
 
 def view(
@@ -48,6 +49,8 @@ def view(
     sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:
         sets = [replace(scans, surprise=_surprise(model, scans.images)) for scans in sets]
+    for scans in sets:
+        _tell_hidden(scans, is_page)
     groups = {scans.name: scans.images for scans in sets}
     if is_page:
         write_page(sets, out)
@@ -55,6 +58,17 @@ def view(
         surprise = {scans.name: scans.surprise for scans in sets if scans.surprise is not None}
         filled = {scans.name: scans.filled for scans in sets if scans.filled is not None}
         plot_comparison(groups, out, surprise=surprise or None, filled=filled)
+
+
+def _tell_hidden(scans: ScanSet, is_page: bool) -> None:
+    """Say how many points of a set of clouds are not shown, and why."""
+    hidden, shown = sum(scans.hidden()), int(scans.images.return_mask.sum())
+    if hidden:
+        sensor = scans.images.sensor
+        cure = "leave samples, runs, --color and data.columns out" if is_page else "write an .html"
+        size = f"{sensor.height}x{sensor.width}"
+        why = f"each pixel of {size} shows one; {cure} to see all"
+        reporting.message(f"{scans.name}: {hidden:,} of {hidden + shown:,} points are hidden, since {why}")
 
 
 def _surprise(model: Generator, images: RangeImage) -> Float[Tensor, "B H W"]:

@@ -1,6 +1,8 @@
 """A source and the sensor that a user named → the sensor whose rays its scans lie on."""
 
+from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError
+from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.data.run_folder import Job, locate
 from lidargrit.data.sources import RunSource
 from lidargrit.data.sources.source import Source
@@ -12,14 +14,26 @@ def sensor_for(source: Source, name: str) -> SensorModel:
     return load_sensor(name) if name else source.sensor
 
 
-def refuse_other_sensor(name: str, model: str, job: Job = "sample") -> None:
-    """Refuse the name of a sensor that is not a run's own, which its networks know alone; "" names none."""
-    if not name:
+def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample") -> None:
+    """Refuse a sensor or columns that are not a run's own, which its networks know alone."""
+    if not (settings.sensor or settings.data.columns):
         return
-    own, sensor = RunSource(model, locate(model, job)).sensor, load_sensor(name)
+    own = RunSource(model, locate(model, job)).sensor
+    sensor = settings.load_sensor() or settings.data.imaged(own.fine())
     if not own.same_rays(sensor):
-        raise ConfigError(
-            f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for --model {model}",
-            f"its own, {own.name!r}, {own.height}x{own.width}",
-            "leave the sensor out, or name another model",
-        )
+        raise other_sensor(sensor, own, model)
+
+
+def other_sensor(sensor: SensorModel, own: SensorModel, model: str) -> ConfigError:
+    """Return the message about a sensor that was named for the scans of a run of another one."""
+    if sensor.name == own.name:
+        cure = "name a run of these columns with --model, or leave the columns out"
+    else:
+        to = own.name if own.name in discovery.names("sensors") else "SENSOR.json"
+        seen = f"lidargrit rescan SCANS SEEN --sensor {sensor.name} --to {to}"
+        cure = f"name a run of that sensor with --model, or first: {seen}, and take SEEN without --sensor"
+    return ConfigError(
+        f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for --model {model}",
+        f"its own, {own.name!r}, {own.height}x{own.width}",
+        cure,
+    )

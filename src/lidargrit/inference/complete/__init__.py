@@ -10,6 +10,7 @@ from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, nearest_names
 from lidargrit.data.images import Provenance
 from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant, trained_on
+from lidargrit.data.sources.scan_sensor import other_sensor
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.nn.devices import usable_device
@@ -108,12 +109,7 @@ def open_model(
             "name another run, such as pretrained",
         )
     if sensor is not None and not generator.sensor.same_rays(sensor):
-        own = f"{generator.sensor.name!r}, {generator.sensor.height}x{generator.sensor.width}"
-        raise ConfigError(
-            f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for --model {word}",
-            f"its own, {own}",
-            "leave the sensor out, or name another model",
-        )
+        raise other_sensor(sensor, generator.sensor, word)
     return Model(word, generator, generator.parse_sampling(settings, completing=True), folder)
 
 

@@ -46,7 +46,7 @@ _RINGS_OFF_AT_MOST_DEG = 2.0  # of a sensor that may be the scan's: in the mean 
 _FEW_POINTS = 0.02  # of what a row has in the median: a stray point does not fill a row
 
 _BY_ELEVATION = "project by elevation: --projection spherical (in Python: method='spherical')"
-_NAME_IT = "name the sensor that made the scan with --sensor, or take a model of it"
+_NAME_IT = "name the sensor that made the scan with --sensor"
 FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file in place of a sensor"
 
 
@@ -162,7 +162,8 @@ def told_doubts(scan: Scan, sensor: SensorModel, method: ProjectionName, source:
         a sentence each, "" where there is no such sign.
     """
     if not (doubt := told_height(scan, sensor)) and (about := doubts_about_rays(scan, sensor, method)):
-        doubt = f"{source or scan.source}, imaged as {sensor.name}: {about}; {_NAME_IT}, {FIT_SENSOR}"
+        cure = f"{_NAME_IT}, or take a model of it, {FIT_SENSOR}"
+        doubt = f"{source or scan.source}, imaged as {sensor.name}: {about}; {cure}"
     return doubt, told_revolutions(scan)
 
 
@@ -350,9 +351,10 @@ def _wrong_elevations(scan: Scan, sensor: SensorModel, outside: float) -> ScanEr
 
 def _name_sensor(scan: Scan, refused: SensorModel) -> str:
     """Return the cure for a scan that another sensor has made."""
+    of_run = f"a run has its own sensor, which sees scans by: lidargrit rescan SCANS SEEN --to {refused.name}"
     if fitting := " or ".join(name for name in sensors_that_fit(scan) if name != refused.name):
-        return f"{_NAME_IT} ({fitting}, {FIT_SENSOR})"
-    return f"{_NAME_IT}; none in the package is like it: {FIT_SENSOR.removeprefix('or ')}"
+        return f"{_NAME_IT} ({fitting}, {FIT_SENSOR}); {of_run}"
+    return f"{_NAME_IT}; none in the package is like it: {FIT_SENSOR.removeprefix('or ')}; {of_run}"
 
 
 def _span_of_rows_deg(sensor: SensorModel) -> tuple[float, float]:

@@ -2,8 +2,8 @@
 
 function returnsOf(source, scan) {
   const pixels = [];
-  for (let pixel = 0; pixel < source.size; pixel++) {
-    if (scan.steps[pixel]) {
+  for (let pixel = 0; pixel < scan.count; pixel++) {
+    if (isReturn(source, scan, pixel)) {
       pixels.push(pixel);
     }
   }
@@ -23,17 +23,18 @@ function binFile(source, scan, points) {
   return [rows];
 }
 
-// PLY, with the ring of every point, and reflectance and label where they are known.
+// PLY, with ring, reflectance and label where all points have them.
 function plyFile(source, scan, points) {
   const pixels = returnsOf(source, scan);
-  const rowBytes = 14 + (scan.reflectance ? 4 : 0) + (scan.label ? 4 : 0);
+  const withRing = scan.beside.length === 0;
+  const rowBytes = 12 + (withRing ? 2 : 0) + (scan.reflectance ? 4 : 0) + (scan.label ? 4 : 0);
   const lines = [
     "ply",
     "format binary_little_endian 1.0",
     `element vertex ${pixels.length}`,
     ...["x", "y", "z"].map((axis) => `property float ${axis}`),
     ...(scan.reflectance ? ["property float intensity"] : []),
-    "property ushort ring",
+    ...(withRing ? ["property ushort ring"] : []),
     ...(scan.label ? ["property uint label"] : []),
     "end_header",
     "",
@@ -48,9 +49,12 @@ function plyFile(source, scan, points) {
       rows.setFloat32(offset, scan.reflectance[pixel] / 255, true);
       offset += 4;
     }
-    rows.setUint16(offset, Math.floor(pixel / source.width), true);
+    if (withRing) {
+      rows.setUint16(offset, Math.floor(pixel / source.width), true);
+      offset += 2;
+    }
     if (scan.label) {
-      rows.setUint32(offset + 2, source.classes[scan.label[pixel]].number, true);
+      rows.setUint32(offset, source.classes[scan.label[pixel]].number, true);
     }
   });
   return [lines.join("\n"), rows];

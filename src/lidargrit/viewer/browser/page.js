@@ -173,7 +173,7 @@ class Page {
   mark(from, pixel) {
     for (const pane of this.panes) {
       const alike = pane.source.height === from.source.height && pane.source.width === from.source.width;
-      pane.mark(alike ? pixel : -1);
+      pane.mark(pane === from || (alike && pixel < pane.source.size) ? pixel : -1);
     }
   }
 }

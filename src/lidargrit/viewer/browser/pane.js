@@ -80,7 +80,7 @@ class Pane {
     }
     event.preventDefault();
     event.stopPropagation();
-    const from = this.marked >= 0 ? this.marked : Math.floor((this.source.height / 2 + 0.5) * this.source.width);
+    const from = this.marked >= 0 && this.marked < this.source.size ? this.marked : Math.floor((this.source.height / 2 + 0.5) * this.source.width);
     this.page.mark(this, Math.min(this.source.size - 1, Math.max(0, from + steps[event.key])));
   }
 
@@ -93,10 +93,25 @@ class Pane {
     this.points = pointsOf(this.source, this.scan);
     this.fresh = true; // points and colours are rendered together, once all panes have theirs
     const number = this.source.scanIndex(index) + 1;
-    const share = Math.round((100 * this.scan.returns) / this.source.size);
-    const returns = this.scan.returns.toLocaleString("en");
-    this.part.about.textContent =
-      `${this.scan.name} (${number} of ${this.source.count}): ${returns} points, from ${share} % of rays${this.source.columns}`;
+    this.part.about.textContent = `${scan.name} (${number} of ${this.source.count}): ${this.counted(scan)}`;
+  }
+
+  // All points in words, and those that are not shown.
+  counted(scan) {
+    const words = (count) => count.toLocaleString("en");
+    const [beside, share] = [scan.beside.length / 3, Math.round((100 * scan.returns) / this.source.size)];
+    const filled = scan.filled?.reduce((sum, one) => sum + one, 0);
+    const parts = [`${words(scan.returns + beside)} points, from ${share} % of rays${this.source.columns}`];
+    if (filled !== undefined) {
+      parts.push(`${words(scan.returns + beside - filled)} were measured and ${words(filled)} filled in by a model`);
+    }
+    if (beside) {
+      parts.push(`${words(beside)} of all have no pixel of their own below`);
+    }
+    if (scan.hidden) {
+      parts.push(`${words(scan.hidden)} more are hidden, since each pixel shows one point`);
+    }
+    return parts.join("; ");
   }
 
   paint(look) {
@@ -107,7 +122,8 @@ class Pane {
     }
     this.painted = true;
     this.drawer.setColours(colours);
-    const picture = new ImageData(colours, this.source.width, this.source.height);
+    const pixels = colours.subarray(0, 4 * this.source.size);
+    const picture = new ImageData(pixels, this.source.width, this.source.height);
     this.part.image.getContext("2d").putImageData(picture, 0, 0);
     const missing = ["reflectance", "surprise", "label"].includes(look.mode) && !this.scan[look.mode];
     this.part.missing.textContent = missing ? `No ${look.mode} is known here.` : "";
@@ -145,12 +161,12 @@ class Pane {
     const matrix = this.page.camera.matrix(cloud.clientWidth / cloud.clientHeight);
     const seen = pixel < 0 ? null : onScreen(matrix, this.points, pixel, cloud.clientWidth, cloud.clientHeight);
     const inside = seen && seen[0] > 0 && seen[1] > 0 && seen[0] < cloud.clientWidth && seen[1] < cloud.clientHeight;
-    cloudMark.hidden = !inside || (!this.page.withDropped && this.scan.steps[pixel] === 0);
-    imageMark.hidden = pixel < 0;
+    cloudMark.hidden = !inside || (!this.page.withDropped && !isReturn(this.source, this.scan, pixel));
+    imageMark.hidden = pixel < 0 || pixel >= this.source.size;
     if (inside) {
       cloudMark.style.transform = `translate(${seen[0]}px, ${seen[1]}px)`;
     }
-    if (pixel >= 0) {
+    if (!imageMark.hidden) {
       const across = (((pixel % this.source.width) + 0.5) / this.source.width) * image.clientWidth;
       const down = ((Math.floor(pixel / this.source.width) + 0.5) / this.source.height) * image.clientHeight;
       imageMark.style.transform = `translate(${across}px, ${down}px)`;
@@ -160,8 +176,9 @@ class Pane {
   // The position comes last: it is what may be cut off where panes are narrow.
   describe(pixel) {
     const { source, scan } = this;
-    const facts = scan.label && scan.steps[pixel] ? [source.classes[scan.label[pixel]].name] : [];
-    if (scan.steps[pixel] === 0) {
+    const returned = isReturn(source, scan, pixel);
+    const facts = scan.label && returned ? [source.classes[scan.label[pixel]].name] : [];
+    if (!returned) {
       facts.push("no return");
     } else {
       facts.push(`${rangeM(source, scan, pixel).toFixed(2)} m away`, `height ${this.points[4 * pixel + 2].toFixed(2)} m`);
@@ -169,14 +186,15 @@ class Pane {
     if (scan.filled?.[pixel]) {
       facts.push("filled by a model");
     }
-    if (scan.reflectance && scan.steps[pixel]) {
+    if (scan.reflectance && returned) {
       facts.push(`reflectance ${(scan.reflectance[pixel] / 255).toFixed(2)}`);
     }
-    if (scan.surprise && scan.steps[pixel]) {
+    if (scan.surprise && returned) {
       const share = scan.surprise[pixel] / 255;
       facts.push(`surprise ${(share * this.page.data.scales.surprise[1]).toFixed(1)} bits${share === 1 ? " or more" : ""}`);
     }
-    return `${facts.join(", ")} (row ${Math.floor(pixel / source.width)}, column ${pixel % source.width})`;
+    const place = `row ${Math.floor(pixel / source.width)}, column ${pixel % source.width}`;
+    return `${facts.join(", ")} (${pixel < source.size ? place : "no pixel of its own"})`;
   }
 
   save(ending, write) {

@@ -38,6 +38,7 @@ class Source {
 
 async function unpackScan(source, data) {
   const steps = new Uint16Array(await unpack(data.range));
+  const beside = new Float32Array(data.beside ? await unpack(data.beside) : 0); // x, y, z of points without a pixel
   let returns = 0;
   for (const step of steps) {
     returns += step > 0;
@@ -45,7 +46,10 @@ async function unpackScan(source, data) {
   return {
     name: data.name,
     steps,
-    returns,
+    beside,
+    count: source.size + beside.length / 3, // of pixels, then of points without one
+    returns, // from pixels
+    hidden: data.hidden,
     reflectance: data.reflectance && new Uint8Array(await unpack(data.reflectance)),
     surprise: data.surprise && new Uint8Array(await unpack(data.surprise)),
     label: data.label && new Uint8Array(await unpack(data.label)),
@@ -76,13 +80,19 @@ async function unpackRays(source) {
   return rays;
 }
 
+// What follows takes the number of a pixel, or beyond these that of a point without one.
+function isReturn(source, scan, pixel) {
+  return pixel >= source.size || scan.steps[pixel] > 0;
+}
+
 function rangeM(source, scan, pixel) {
-  return scan.steps[pixel] * source.rangeStepM;
+  const at = 3 * (pixel - source.size);
+  return at < 0 ? scan.steps[pixel] * source.rangeStepM : Math.hypot(...scan.beside.subarray(at, at + 3));
 }
 
 // x, y, z and 1 for a return, 0 for the end of a ray that did not return.
 function pointsOf(source, scan) {
-  const points = new Float32Array(4 * source.size);
+  const points = new Float32Array(4 * scan.count);
   for (let pixel = 0; pixel < source.size; pixel++) {
     const returned = scan.steps[pixel] > 0;
     const range = returned ? rangeM(source, scan, pixel) : source.endM;
@@ -91,32 +101,37 @@ function pointsOf(source, scan) {
     }
     points[4 * pixel + 3] = returned ? 1 : 0;
   }
+  for (let pixel = source.size; pixel < scan.count; pixel++) {
+    const at = 3 * (pixel - source.size);
+    points.set([...scan.beside.subarray(at, at + 3), 1], 4 * pixel);
+  }
   return points;
 }
 
-// What can be shown by colour: the position of a pixel on the ramp, 0 to 1.
+// What can be shown by colour: the position of a pixel on the ramp, 0 to 1; NaN where it is not known.
 const POSITIONS = {
   range: (source, scan, points, [near, far]) => (pixel) =>
     Math.log(rangeM(source, scan, pixel) / near) / Math.log(far / near),
   height: (source, scan, points, [low, high]) => (pixel) => (points[4 * pixel + 2] - low) / (high - low),
   reflectance: (source, scan) => scan.reflectance && ((pixel) => scan.reflectance[pixel] / 255),
   surprise: (source, scan) => scan.surprise && ((pixel) => scan.surprise[pixel] / 255),
-  ring: (source) => (pixel) => Math.floor(pixel / source.width) / Math.max(1, source.height - 1),
+  ring: (source) => (pixel) =>
+    pixel < source.size ? Math.floor(pixel / source.width) / Math.max(1, source.height - 1) : NaN,
 };
 
 // Red, green, blue and opacity of every pixel, for points and for the range image alike.
 function coloursOf(source, scan, points, look) {
-  const colours = new Uint8ClampedArray(4 * source.size).fill(255);
+  const colours = new Uint8ClampedArray(4 * scan.count).fill(255);
   const ramp = look.ramps[look.mode];
   const position = ["label", "filled"].includes(look.mode) ? null : POSITIONS[look.mode](source, scan, points, look.scales[look.mode]);
   const classOf = look.mode === "label" && scan.label && ((pixel) => source.classes[scan.label[pixel]].colour);
-  for (let pixel = 0; pixel < source.size; pixel++) {
+  for (let pixel = 0; pixel < scan.count; pixel++) {
     let colour = look.unknown;
-    if (scan.steps[pixel] === 0) {
+    if (!isReturn(source, scan, pixel)) {
       colour = look.noReturn;
     } else if (position) {
       const step = Math.round(Math.min(1, Math.max(0, position(pixel))) * (ramp.length - 1));
-      colour = ramp[step];
+      colour = ramp[step] ?? look.unknown;
     } else if (look.mode === "filled") {
       colour = scan.filled?.[pixel] ? look.filled : look.measured;
     } else if (classOf) {
