@@ -270,7 +270,8 @@ class Desk {
         "with raydrop": `raydrop by ${by}`,
         reconstructed: `reconstructed by ${by}`,
       }[source.name];
-      return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, data.scales);
+      const shown = Object.assign(new Source(source), { name: name ?? source.name });
+      return new ServedPane(shown, this.page, job, group, data.scales);
     });
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
     fresh.at(-1).element.scrollIntoView({ block: "nearest" }); // on a small screen the form lies below
