@@ -82,13 +82,16 @@ def project(
     return project_scan(_as_scan(points), sensor, method, variant, partial)
 
 
-def complete(points: Points, model: str | Model = "pretrained", seed: int = 0) -> CompletedScan:
+def complete(
+    points: Points, model: str | Model = "pretrained", seed: int = 0, sensor: SensorModel | str | None = None
+) -> CompletedScan:
     """Fill in every ray of a scan that has no point, and keep all points as they are.
 
     Args:
         points: scan, or its points as an array (n, 3) or (n, 4) in metres.
         model: run that completes scans, or what :func:`open_model` returned; open a run once for many scans.
         seed: seed of what is sampled.
+        sensor: sensor of the scan, for a classical method (``model="nearest"``); a run has its own.
 
     Returns:
         the points that stay and those that were added; ``whole()`` gives one scan whose ``filled`` marks the added.
@@ -101,7 +104,8 @@ def complete(points: Points, model: str | Model = "pretrained", seed: int = 0) -
         whole = lidargrit.complete(points).whole()
         whole.points_xyz_m[~whole.filled]  # the measured points, bit for bit
     """
-    return complete_scan(_as_scan(points), _opened(model, "pixels"), None, seed)
+    own = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    return complete_scan(_as_scan(points), _opened(model, "pixels", own), None, seed)
 
 
 def upsample(
@@ -178,10 +182,11 @@ def _source(scans: str | Sequence[Points], sensor: SensorModel) -> Source:
     return MemorySource([_as_scan(points) for points in scans], sensor)
 
 
-def _opened(model: str | Model, kind: ConditionKind) -> Model:
+def _opened(model: str | Model, kind: ConditionKind, sensor: SensorModel | None = None) -> Model:
     if isinstance(model, Model):
         return model
-    return _packaged(model, kind) if model in {folder.name for folder in PACKAGED} else open_model(model, kind)
+    packaged = model in {folder.name for folder in PACKAGED}
+    return _packaged(model, kind) if packaged and sensor is None else open_model(model, kind, sensor)
 
 
 @lru_cache
