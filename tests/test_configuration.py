@@ -172,12 +172,14 @@ def test_a_setting_that_does_not_fit_is_told_in_one_line(setting, text):
             r"channel_multipliers=18446744073709551616; wanted a whole number, at least 1",
         ),
         (VqvaeConfig, {"channel_multipliers": [1, "x"]}, r"does not fit \(.*channel_multipliers"),
+        (VqvaeConfig, {"channels": 10**4000}, r"does not fit \(channels=10{10,200} \[\.\.\.\]; wanted a whole number"),
     ],
 )
 def test_json_that_does_not_fit_is_told_in_one_line(cls, change, text):
     with pytest.raises(ConfigError, match=text) as refusal:
         from_json(cls, to_json(cls()) | change, "run.json")
     assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 600
 
 
 @pytest.mark.parametrize("data", [None, 3, "words", [1], {}])

@@ -97,6 +97,21 @@ def test_scans_of_other_endings_are_named_with_a_cure(tmp_path, name):
     )
 
 
+def test_poses_times_and_remarks_beside_scans_are_not_called_scans(tmp_path):
+    write_bin(tmp_path / "a.bin")
+    for name, text in {
+        "poses": "1 0 0 0 0 1 0 0 0 0 1 0\n",
+        "times": "0.1\n",
+        "calib": "Tr: 1 0 0\n",
+        "README": "8 scans of a drive\n",
+        "timestamps": "2011-09-26 13:02:25.964389445\n",
+    }.items():
+        (tmp_path / f"{name}.txt").write_text(text)
+    assert open_dataset(str(tmp_path)).notes == ()
+    (tmp_path / "cloud.txt").write_text("-1.5e+00, 2, 0.3 , 17\n1 2 3 4\n")
+    assert open_dataset(str(tmp_path)).notes[0].startswith("1 file .txt beside 1 that are read left out")
+
+
 def test_the_cure_for_text_works(tmp_path):
     np.savetxt(tmp_path / "a.csv", xyz_of(TABLE).numpy(), header="x y z", comments="")
     assert len(read_scan(tmp_path / "a.csv")) == len(TABLE["x"])
@@ -124,7 +139,9 @@ def test_packets_of_other_makers_are_told(tmp_path, port, maker, with_json):
 
 def test_packets_of_an_ouster_lack_its_metadata(tmp_path):
     (tmp_path / "a.pcap").write_bytes(packets(7502))
-    with pytest.raises(ScanError, match=r"without a\.json"):
+    with pytest.raises(
+        ScanError, match=r"without a\.json; .*if an Ouster sent it, .*else convert it by the maker's tool"
+    ):
         read_scan(tmp_path / "a.pcap")
 
 

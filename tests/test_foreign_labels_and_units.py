@@ -71,10 +71,11 @@ def test_range_images_in_another_unit_are_refused_despite_a_stray_pixel(tmp_path
         images.batch([1])
 
 
-def test_a_few_ranges_beyond_the_limits_are_no_other_unit(tmp_path):
+def test_a_few_ranges_beyond_the_limits_are_no_other_unit_but_told(tmp_path, heard):
     image = np.full((16, 90), 9.0, np.float32)
     image[:, :40] = 200
     image[:, 80:] = 0
     np.save(tmp_path / "a.npy", image)
     loaded = open_source(str(tmp_path)).images(load_sensor("vlp16").with_columns(90)).batch([0])
     assert torch.equal(loaded.return_mask.sum(), torch.tensor(16 * 40))
+    assert any("50% of the ranges of" in line and "check the unit" in line for line in heard)

@@ -54,7 +54,7 @@ def with_cell(row: int, column: int | slice, value: float) -> np.ndarray:
 
 def test_the_longest_ending_counts(tmp_path):
     assert [one.public_name() for one in candidates(tmp_path / "a.PCD.bin")] == ["nuscenes_bin"]
-    assert [one.public_name() for one in candidates(tmp_path / "a.b.bin")] == ["kitti_bin", "xyz_bin"]
+    assert [one.public_name() for one in candidates(tmp_path / "a.b.bin")] == ["kitti_bin", "nclt_bin", "xyz_bin"]
     assert [stem(tmp_path / name) for name in ("a.pcd.bin", "a.b.bin", "a.pcd", "a.b.txt")] == ["a", "a.b", "a", "a.b"]
     (tmp_path / "a.txt").write_text("no scan")
     with pytest.raises(ScanError, match=r"a\.txt, whose ending we do not know; wanted one of \.bag, \.bin, "):
@@ -260,7 +260,11 @@ def test_reflectance_beyond_all_scales_is_refused(tmp_path, values):
         ({"label": [0, 2**32]}, "a label that is not whole or out of bounds"),
         ({"ring": [0, 1, 2]}, r"2 points, but ring of shape \(3,\)"),
         ({"ring": [[0, 0], [1, 1]]}, r"2 points, but ring of shape \(2, 2\)"),
-        ({"points": np.ones((2, 6))}, r"an array of shape \(2, 6\)"),
+        ({"points": np.ones((2, 6))}, r"an array of shape \(2, 6\).*keep x, y, z, intensity, ring of each point"),
+        (
+            {"points": np.ones(8)},
+            r"of shape \(8,\).*into rows, such as array.view\(np.float32\).reshape\(-1, 4\)",
+        ),
         ({"points": np.ones((2, 3), complex)}, "an array of dtype"),
         ({"points": np.zeros((0, 3))}, "no point in"),
         ({"points": np.array([[None] * 3] * 2)}, "an array of dtype"),
@@ -272,7 +276,9 @@ def test_archives_of_other_arrays_are_refused(tmp_path, arrays, text):
         load("numpy_array").read(tmp_path / "a.npz")
 
 
-def test_samples_of_ours_are_no_scans_and_say_so(tmp_path):
+def test_samples_of_ours_are_no_scans_and_say_so_as_do_other_arrays(tmp_path):
+    np.savez(tmp_path / "1.npz", pc=np.ones((2, 3)), more=np.ones((2, 3)))
+    assert refusal(tmp_path / "1.npz").endswith("; call the array of points 'points'")
     np.savez(tmp_path / "0.npz", range_m=np.ones((64, 256)))
     assert not load("numpy_array").recognises(tmp_path / "0.npz")
     assert refusal(tmp_path / "0.npz").endswith(f"; name the whole folder: {tmp_path}")

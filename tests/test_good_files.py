@@ -9,6 +9,8 @@ import torch
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import read_scan
 from lidargrit.data.sources import open_source
+from lidargrit.scans.projection import closest_sensor
+from lidargrit.scans.sensors import load_sensor
 from street_corner import corner, pcd_bytes, rows_of, xyz_of
 
 TABLE = corner()
@@ -175,20 +177,6 @@ def test_arrays_by_name_by_column_and_organised(tmp_path):
         assert open_source(str(tmp_path / f"{name}.npz")).kind == "scans"
 
 
-@pytest.mark.parametrize(
-    ("arrays", "cure"),
-    [
-        ({"pc": ROWS["x"], "more": ROWS["y"]}, "call the array of points 'points'"),
-        ({"points": ROWS["x"]}, r"shape it into rows, such as array.view\(np.float32\).reshape\(-1, 4\)"),
-        ({"points": np.zeros((POINTS, 6))}, "keep x, y, z, intensity, ring of each point"),
-    ],
-)
-def test_other_arrays_are_refused_with_what_to_do(tmp_path, arrays, cure):
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(ScanError, match=cure):
-        read_scan(tmp_path / "a.npz")
-
-
 def test_a_fourth_column_of_rings_is_no_reflectance(tmp_path):
     np.save(tmp_path / "a.npy", np.c_[xyz_of(TABLE).numpy(), TABLE["ring"]].astype(np.float32))
     scan = check(tmp_path / "a.npy", with_reflectance=False)
@@ -196,3 +184,22 @@ def test_a_fourth_column_of_rings_is_no_reflectance(tmp_path):
     assert scan.ring.tolist() == TABLE["ring"].tolist()
     np.save(tmp_path / "b.npy", np.c_[xyz_of(TABLE).numpy(), np.round(TABLE["intensity"] / 16)].astype(np.float32))
     assert read_scan(tmp_path / "b.npy").ring is None
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_rows_of_nclt_are_read_with_y_to_the_left_and_z_up(tmp_path, odd):
+    sensor = load_sensor("hdl32e")
+    points = xyz_of(corner(0, sensor, 128)).double().numpy()
+    points = points[np.random.default_rng(0).permutation(len(points))][: len(points) // 2 * 2 - odd]
+    rows = np.zeros(len(points), [("x", "<u2"), ("y", "<u2"), ("z", "<u2"), ("intensity", "u1"), ("laser", "u1")])
+    for axis, values in zip("xyz", (points * (1, -1, -1)).T, strict=True):  # the sensor's own axes
+        rows[axis] = np.round((values + 100) / 0.005)
+    rows["intensity"], rows["laser"] = np.arange(len(rows)) % 256, np.arange(len(rows)) % 32
+    (tmp_path / "1326030975726043.bin").write_bytes(rows.tobytes())
+    scan = read_scan(tmp_path / "1326030975726043.bin")
+    assert np.abs(scan.points_xyz_m.numpy() - points).max() < 0.0026  # half a step
+    assert torch.equal(scan.reflectance, torch.arange(len(rows)).remainder(256) / 255)
+    assert closest_sensor(scan) == "hdl32e"
+    (tmp_path / "b.bin").write_bytes(rows.tobytes()[:-1])
+    with pytest.raises(ScanError, match="more than whole points"):
+        read_scan(tmp_path / "b.bin")

@@ -63,7 +63,29 @@ def test_shuffled_points_tell_no_revolutions():
     scan = turned(2)
     order = torch.randperm(len(scan), generator=torch.Generator().manual_seed(0))
     assert revolutions(Scan(scan.points_xyz_m[order], None, scan.ring[order])) is None
-    assert revolutions(Scan(scan.points_xyz_m)) is None
+    assert revolutions(Scan(scan.points_xyz_m[order])) is None
+    assert revolutions(Scan(turned(1, by_column=False).points_xyz_m)) is None, "ring by ring"
+
+
+@pytest.mark.parametrize("turns", [1, 1.5, 2])
+def test_revolutions_are_counted_without_rings(turns):
+    scan = Scan(turned(turns).points_xyz_m)
+    assert revolutions(scan) == pytest.approx(turns, abs=0.03)
+    assert bool(told_revolutions(scan)) is (turns > 1)
+
+
+@pytest.mark.parametrize("order", ["one after the other", "all first, then all last"])
+def test_two_returns_of_a_beam_are_told(order):
+    points = turned(1).points_xyz_m
+    pairs = torch.stack([points, points * 1.05])
+    pairs = pairs.transpose(0, 1) if order == "one after the other" else pairs
+    told = told_revolutions(Scan(pairs.reshape(-1, 3)))
+    if order == "one after the other":
+        assert told.startswith("50% of the points of a scan lie behind or before another of the same beam: two returns")
+    else:
+        assert "revolutions in a scan: 50% of the points" in told, "they are stored like two"
+    assert told in inspect(Scan(pairs.reshape(-1, 3)), load_sensor("vlp16").with_columns(COLUMNS)).problems
+    assert told_revolutions(Scan(points)) == ""
 
 
 @pytest.mark.parametrize(("columns", "is_told"), [(512, True), (870, False)])

@@ -41,8 +41,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.scans.motion import UndoMotion
     from lidargrit.scans.sensors import load_sensor
 
-    sensor = load_sensor(options.sensor) if options.sensor else None
     config = scan_settings(options, max_scans=options.count).data
+    sensor = config.imaged(load_sensor(options.sensor)) if options.sensor else None
     change = UndoMotion(read_trajectory(options.undo_motion)) if options.undo_motion else None
     count = export_scans(options.scans, options.out, options.format, config, sensor, change)
     print(f"done: {counted_scans(count)} in {options.out}; export.json says which file holds which scan")

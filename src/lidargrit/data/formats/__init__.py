@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from io import BufferedReader
@@ -32,6 +33,8 @@ _CURES = {  # by the ending, for files that hold scans but are not read
     (".bag.active",): "finish it with: rosbag reindex",
     (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
 }
+_LINE_BYTES = 400
+_LINE_OF_A_POINT = re.compile(rb"\s*(?:[-+.\d][-+.\deE]*[ \t,;]+){2,7}[-+.\d][-+.\deE]*[ \t]*\r?(?:\n|\Z)")
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
 
 
@@ -173,8 +176,11 @@ def cure_of_ending(path: Path) -> str:
 
 
 def is_of_other_program(path: Path) -> bool:
-    """Return whether a file is called like scans that we do not read."""
-    return path.name.lower().endswith(tuple(ending for endings in _CURES for ending in endings))
+    """Return whether a file is called like scans that we do not read; poses, times and remarks (.txt) are none."""
+    name = path.name.lower()
+    if name.endswith(".txt"):
+        return bool(_LINE_OF_A_POINT.match(first_bytes(path, _LINE_BYTES)))
+    return name.endswith(tuple(ending for endings in _CURES for ending in endings))
 
 
 def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:

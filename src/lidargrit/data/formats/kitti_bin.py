@@ -16,6 +16,7 @@ from lidargrit.scans.types import Scan
 _COLUMNS = ("x", "y", "z", "intensity")
 _ROW_BYTES = 16
 _ROWS_TO_LOOK_AT = 4096  # enough to tell reflectance from a coordinate
+_LEAST_REFLECTANCE = 1e-12  # above 0; bytes of other numbers, such as NCLT's, give far less
 _FORMAT = "float32 rows x, y, z, reflectance, 16 bytes a point"
 
 
@@ -39,7 +40,8 @@ class KittiBin(ScanFormat):
             return False
         values = np.frombuffer(start, dtype="<f4")
         last = values[3::4]
-        return bool(((last >= 0) & (last <= 1)).all()) and not wide_row(values)
+        reflectance = (last == 0) | ((last >= _LEAST_REFLECTANCE) & (last <= 1))
+        return bool(reflectance.all()) and not wide_row(values)
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:

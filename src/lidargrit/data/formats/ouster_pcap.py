@@ -181,7 +181,8 @@ def _metadata_of(path: Path) -> Path:
         cure = "convert it by the maker's tool, or play it through its ROS driver and record the topic of point clouds"
         raise ScanError(f"{path}, no recording of an Ouster ({maker})", _FORMAT, cure)
     others = sorted(one.name for one in path.parent.glob("*.json")) if path.parent.is_dir() else []
-    cure = f"if it is {' or '.join(others[:3])}, give it that name" if others else _CURE
+    other_maker_cure = f"if an Ouster sent it, {_CURE}; else convert it by the maker's tool"
+    cure = f"if it is {' or '.join(others[:3])}, give it that name" if others else other_maker_cure
     raise ScanError(f"{path} without {metadata.name}", _FORMAT, cure)
 
 

@@ -26,7 +26,7 @@ _VALUES_PER_M = 500
 _TOP_DEG, _BOTTOM_DEG = 1.94, -25.0
 _TAKEN = (
     f"taken as steps of {1000 // _VALUES_PER_M} mm and rows from {_TOP_DEG:+g} to {_BOTTOM_DEG:g} degrees; for other "
-    "steps or rows save ranges in metres as .npy, and name the sensor"
+    "steps or rows save ranges in metres as .npy, and name the sensor (--sensor, --set data.columns=N)"
 )
 _FORMAT = "a 16-bit grey PNG of 64 rows: value / 500 = metres, 0 = no return"
 

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidargrit.core import discovery
+from lidargrit.core import discovery, reporting
 from lidargrit.core.arrays import ARRAY_BYTES_AT_MOST, parse_array
 from lidargrit.core.determinism import evenly_spaced, natural_order
-from lidargrit.core.errors import ConfigError, DataError, LidarGritError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, LidarGritError, ScanError, printable
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.datasets.folder import Folder
@@ -21,6 +21,7 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 
 PROBABILITY = ".probability.npy"  # how files end that tell the share of returns, and are no scans
 _IMAGE = "a range image: an .npy of (H, W) ranges in metres"
+_TOLD_BELOW = 0.9  # a tenth of the returns is no stray pixel
 _WITHIN_AT_LEAST = 0.5  # of the pixels with a return: real images have nearly all, those in another unit next to none
 _POINT_COLUMNS_AT_MOST = 5  # x, y, z, reflectance, ring: what is wider is an image
 
@@ -99,7 +100,7 @@ def image_files(path: Path) -> list[Path]:
 
 class _ImageFiles:
     def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
-        self._paths, self._sensor = paths, sensor
+        self._paths, self._sensor, self._told = paths, sensor, False
         self.provenance = Provenance(tuple(str(path.absolute()) for path in paths))
 
     def __len__(self) -> int:
@@ -123,6 +124,11 @@ class _ImageFiles:
             raise ScanError(
                 what, f"ranges in metres, {sensor.range_min_m:g} to {sensor.range_max_m:g}", "check the unit"
             )
+        if inside < _TOLD_BELOW * returns and not self._told:
+            self._told = True
+            limits = f"the sensor's limits, {sensor.range_min_m:g} to {sensor.range_max_m:g} m"
+            what = f"{1 - inside / returns:.0%} of the ranges of {printable(str(path))} lie beyond {limits}"
+            reporting.message(f"WARNING: {what}, and are left out; check the unit")
         return Pixels(np.where(within, range_m, np.float32(0)))
 
 
