@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine: `make demo` and `make test`.
-#   make demo              the main job on simulated streets, three to five minutes on two cores with bfloat16
+#   make demo              the main job on simulated streets, some minutes on two cores
 #   make demo DATA=FOLDER  the same on your own KITTI-style scans
 #   make test              all checks and all tests
 #   make environment       .venv alone, which all others make if it is missing; a few minutes, see install.sh

@@ -304,7 +304,6 @@ def test_doctor_tells_versions_and_room(typed):
 
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
     monkeypatch.setattr(*ONE_METRIC)
-    monkeypatch.setattr("lidargrit.viewer.demo._PACKAGED_SCANS", 1)
     monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 11)  # as many as its pictures show
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)
@@ -315,13 +314,12 @@ def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
         "scans_reconstructed_generated.png",
         "generated.png",
         "samples/00000010.npz",
-        "samples_of_packaged_model/00000000.npz",
         "model.safetensors",
     ):
         assert name in before
     evaluation = json.loads(before["evaluation.json"])
     assert evaluation["reconstruction_on_val"]["num_scans"] == 2
-    assert evaluation["generated_against_train"]
+    assert evaluation["generated_against_val"]
     typed(*words)
     again = contents(tmp_path / "demo")
     for content in (before, again):  # all but how long it took

@@ -1,11 +1,13 @@
 """What a message tells to type: every verb that reads scans takes each option that its messages name, and guesses."""
 
+import ast
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import lidargrit
 from lidargrit.cli import build_parser, main
 from lidargrit.data.sources import open_source
 from lidargrit.scans.sensors import load_sensor
@@ -97,6 +99,22 @@ def test_every_verb_that_reads_scans_is_here():
     assert reading == VERBS.keys()
     for verb in reading - {"export", "fit-sensor"}:  # the one projects nothing, the other finds the sensor
         assert {"--sensor", "--projection", "--bad-points", "--set"} <= PARSERS[verb]._option_string_actions.keys()
+
+
+def test_no_text_of_the_program_names_an_option_that_no_verb_has():
+    known = {"--version", "--print-completion", "--no-python", "--nproc-per-node"}  # the last two are torchrun's
+    for parser in PARSERS.values():
+        known |= parser._option_string_actions.keys()
+    for path in Path(lidargrit.__file__).parent.rglob("*.py"):
+        texts = [
+            node.value
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Constant)
+        ]
+        for text in texts:
+            if isinstance(text, str) and "var(--" not in text and ":root{" not in text:  # of styles
+                named = {*re.findall(r"(?<![\w-])--[a-z][a-z-]+", text)}
+                assert named <= known, f"{path.name}: {text[:200]}"
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -49,7 +49,7 @@ def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):
         "scoring",
     ]
     assert words.startswith("The tokenizer and the pixel decoder come as trained, from the model in the package")
-    assert words.endswith("The transformer learns anew here.")
+    assert words.endswith("The transformer learns further here, from the weights of that model.")
     assert said == ""
     assert demo._sampling(preset) == TokenSampling()
     for settings, anew in ((["data.columns=512", "data.column_stride=8"], False), ([], True)):

@@ -1,6 +1,7 @@
 """The page of the demo: a scan, its tokens and what comes of them, as it is written and as a browser shows it."""
 
 import json
+import math
 import re
 import shlex
 from dataclasses import replace
@@ -53,7 +54,9 @@ def written(tmp_path_factory, scored) -> Path:
     folder.mkdir()
     generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.write_results_page(generator, "simulated", val, scored[0], errors, scored[1], SECONDS, ("a <fact>",), folder)
+    demo.write_results_page(
+        generator, "simulated", val, val, scored[0], errors, scored[1], SECONDS, ("a <fact>",), folder
+    )
     return folder / "demo.html"
 
 
@@ -65,7 +68,7 @@ def with_pixel_decoder(tmp_path_factory, scored) -> Path:
     generator = LidarGrit(replace(plain.config, pixels=sizes), SENSOR).eval()
     val = RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.write_results_page(generator, "simulated", val, scored[0], errors, scored[1], SECONDS, (), folder)
+    demo.write_results_page(generator, "simulated", val, val, scored[0], errors, scored[1], SECONDS, (), folder)
     return folder / "demo.html"
 
 
@@ -109,7 +112,7 @@ def test_a_pixel_decoder_is_shown_phase_by_phase(written, with_pixel_decoder):
     plain, text = written.read_text(encoding="utf-8"), with_pixel_decoder.read_text(encoding="utf-8")
     titles = re.findall(r"<h2>(.*?)</h2>", text)
     assert [title[:2] for title in titles] == ["1.", "2.", "3.", "4.", "5.", "6.", "7.", "8.", "Wh"]
-    assert "phase by phase" in titles[4]
+    assert "phase by phase" in titles[5]
     assert "pixel decoder" not in plain
     numbers = re.findall(r"<figcaption>return mask after (\d+) phases?</figcaption>", text)
     assert numbers == ["1", "4", "7", "10"]
@@ -120,8 +123,8 @@ def test_a_pixel_decoder_is_shown_phase_by_phase(written, with_pixel_decoder):
 def test_a_browser_shows_it(written, browser):
     browser.open(written)
     names = browser.run("[...document.querySelectorAll('[data-part=name]')].map((one) => one.textContent)")
-    assert names == ["simulated, held out", "reconstructed", "new"]
-    for which in range(3):
+    assert names == ["new", "nearest simulated scan of training"]
+    for which in range(2):
         for canvas in (".cloud", ".image"):
             picture = browser.screenshot(canvas, which)
             assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
@@ -132,6 +135,22 @@ def test_a_browser_shows_it(written, browser):
     assert browser.run("document.querySelector('#counter').textContent") == "Scan 2 of 6"
     assert browser.troubles() == []
     assert browser.requests() == []
+
+
+def test_the_nearest_scan_is_that_of_a_loop_over_pixels():
+    real = RangeImages(SENSOR, [Store()])
+    new = real.batch([7, 3])
+    new = replace(new, range_m=new.range_m * 1.01)
+    assert demo._nearest(new, real) == [7, 3]
+    other = real.batch([1])
+    sums = []
+    for index in range(len(real)):
+        one = real.batch([index]).range_m[0]
+        pixels = np.ndindex(*one.shape)
+        sums.append(
+            sum(abs(math.log1p(float(one[at])) - math.log1p(float(1.3 * other.range_m[0][at]))) for at in pixels)
+        )
+    assert demo._nearest(replace(other, range_m=1.3 * other.range_m), real) == [int(np.argmin(sums))]
 
 
 def test_times_are_those_of_the_first_time(tmp_path):

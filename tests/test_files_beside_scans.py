@@ -109,7 +109,11 @@ def test_poses_times_and_remarks_beside_scans_are_not_called_scans(tmp_path):
         (tmp_path / f"{name}.txt").write_text(text)
     assert open_dataset(str(tmp_path)).notes == ()
     (tmp_path / "cloud.txt").write_text("-1.5e+00, 2, 0.3 , 17\n1 2 3 4\n")
-    assert open_dataset(str(tmp_path)).notes[0].startswith("1 file .txt beside 1 that are read left out")
+    assert open_dataset(str(tmp_path)).notes[0].startswith("1 file .txt beside 1 that are read left out; put a line")
+    for name in ("b.laz", "c.laz"):
+        (tmp_path / name).write_bytes(b"LASF")
+    told = "2 files .laz, 1 file .txt beside 1 that are read left out; of .laz: unpack it to .las"
+    assert open_dataset(str(tmp_path)).notes[0].startswith(told)
 
 
 def test_the_cure_for_text_works(tmp_path):

@@ -12,6 +12,7 @@ from lidargrit import project, simulate
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.datasets import open_dataset
+from lidargrit.data.prepared.config import DataConfig
 from lidargrit.scans.fit_sensor import SensorFit, fit_sensor, fit_sensor_to_dataset
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans
 from lidargrit.scans.fit_sensor.elevations import nearest_row, rows_of_rings
@@ -382,7 +383,11 @@ def test_points_that_lie_half_a_column_off_keep_a_pixel_each_or_are_told(name, c
     sensor = replace(sensor, first_edge_rad=edge_rad, azimuth_rad=column_azimuths_rad(columns, first_edge_rad=edge_rad))
     scans = [simulate(seed, sensor) for seed in range(3)]
     fit = fit_sensor(scans)
-    told = any("share a pixel" in warning for warning in fit.warnings)
-    hidden = 1 - int(project(scans[0], fit.sensor).return_mask.sum()) / len(scans[0])
+    told = any(f"share a pixel (--set data.columns={columns} keeps them apart)" in note for note in fit.warnings)
+    hidden, with_own_columns = (
+        1 - int(project(scans[0], seen).return_mask.sum()) / len(scans[0])
+        for seen in (fit.sensor, DataConfig(columns=columns).imaged(fit.sensor))
+    )
     assert (hidden <= 0.01) != told
+    assert with_own_columns <= 0.01
     assert told == (columns % 8 != 0)

@@ -79,3 +79,14 @@ def test_a_few_ranges_beyond_the_limits_are_no_other_unit_but_told(tmp_path, hea
     loaded = open_source(str(tmp_path)).images(load_sensor("vlp16").with_columns(90)).batch([0])
     assert torch.equal(loaded.return_mask.sum(), torch.tensor(16 * 40))
     assert any("50% of the ranges of" in line and "check the unit" in line for line in heard)
+
+
+def test_range_images_of_other_columns_are_exported_by_the_setting_that_names_them(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((64, 512), 78.264, np.float32))
+    out, words = tmp_path / "out", ["--format", "npz", "--sensor", "os1_64", "--set", "data.columns=512"]
+    assert main(["export", str(tmp_path / "a.npy"), str(out), *words]) == 0
+    points = read_scan(out / "a.npz").points_xyz_m
+    assert len(points) == 64 * 512
+    assert torch.allclose(points.norm(dim=1), torch.tensor(78.264))
+    elevation_deg = torch.asin(points[:, 2] / 78.264).rad2deg()
+    assert elevation_deg.abs().max() == pytest.approx(16.611, abs=1e-3)

@@ -6,7 +6,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_scans, scan_words
 
 EXAMPLES = """\
-  lidargrit demo                                simulated streets, three to five minutes on two cores with bfloat16
+  lidargrit demo                                simulated streets, some minutes on two cores
   lidargrit demo --data /data/kitti_odometry    your own scans: a KITTI tree, or any folder of .bin
   lidargrit demo --anew --out runs/demo_anew    all networks trained anew, about ten minutes
 """

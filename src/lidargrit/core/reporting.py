@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _SILENT_S_AT_MOST = 10.0  # between two lines of one piece of work, where there is no terminal
-_SILENT_AT_FIRST_S = 1.2  # while libraries are loaded, which takes some seconds
+_SILENT_AT_FIRST_S = 0.7  # while libraries are loaded, which takes some seconds
 _MARGIN_S = 1.0  # by which a line about silence comes before it is too long
 _PRIOR_S = 10.0  # of expected work that counts as having taken as long as expected, so that first seconds mislead less
 _NOTE_COLUMNS = 110  # of a terminal; narrower ones show no note behind the bar

@@ -41,7 +41,6 @@ main{display:block;max-width:1240px}
 .three{display:grid;grid-template-columns:repeat(3,1fr);gap:4px 20px}
 .phases{display:grid;grid-template-columns:repeat(4,1fr);gap:4px 14px;margin-bottom:1em}
 .points{min-height:380px}
-@media (min-width:1000px){#panes:has(> :nth-child(3):last-child){grid-template-columns:repeat(3,1fr)}}
 .bar rect,rect.bar{fill:var(--b)}
 .tokens{width:100%;max-width:760px;font-family:ui-monospace,monospace}
 .grid{display:block;width:100%;height:170px;border-radius:3px}
@@ -68,7 +67,7 @@ class DemoPage:
         lattices: lattices of the pixel decoder, each with the number of phases after which it is complete.
         sets: sets of scans to turn side by side.
         errors: errors of reconstruction over all held-out scans.
-        card: scores of new scans against training scans, with real against real and pixel statistics.
+        card: scores of new scans against held-out scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         run: folder of the run.
@@ -97,13 +96,14 @@ def write_demo_page(demo: DemoPage, path: Path) -> None:
 
 def page(demo: DemoPage) -> str:
     """Return the page as text; names of files and other foreign text are escaped."""
-    steps = [_the_scan, _its_tokens, _its_reconstruction, _its_raydrop, _its_phases, _new_scans, _scores, _timings]
+    steps = [_new_scans, _the_scan, _its_tokens, _its_reconstruction, _its_raydrop, _its_phases, _scores, _timings]
     if demo.by_phases is None:
         steps.remove(_its_phases)
     parts = [_lead(demo), *(_step(f"{number}. ", *step(demo)) for number, step in enumerate(steps, 1)), _next(demo)]
     looks = f"{interactive.style()}{STYLE}{_STYLE}"
     title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets)
-    return document(title, looks, "\n".join(parts), interactive.opening_script(), scans, "data: blob:")
+    script = interactive.opening_script() + "page.turn();\n"
+    return document(title, looks, "\n".join(parts), script, scans, "data: blob:")
 
 
 class _Step(NamedTuple):
@@ -117,11 +117,9 @@ class _Step(NamedTuple):
 def _lead(demo: DemoPage) -> str:
     facts = "".join(f"<li>{escape(fact)}</li>" for fact in demo.facts)
     return (
-        "<h1>A LiDAR scan, its tokens, and new scans</h1>\n"
+        "<h1>New LiDAR scans, and how they came about</h1>\n"
         '<p class="lead">This page shows what <code>lidargrit demo</code> has just done. Networks learned from '
-        f"{demo.kind} LiDAR scans, in part for a few minutes only. They now generate scans that no sensor recorded. A "
-        "model so small, trained for so short a time, is a demonstration and not a good model: its scores cannot be "
-        "compared with published tables.</p>"
+        f"{demo.kind} LiDAR scans, and now generate scans that no sensor recorded.</p>"
         f'<ul class="facts">{facts}</ul>'
     )
 
@@ -169,7 +167,9 @@ def _its_tokens(demo: DemoPage) -> _Step:
         f"to {demo.tokens.num_codes - 1}, one for each block of {block} x {block} pixels. Each number is the index of "
         f"a learned code, and is called a token. Nothing else of the scan is kept. This scan uses "
         f"{len(np.unique(tokens))} of the {demo.tokens.num_codes} codes. Each code has its own colour here; the "
-        "colours are in the order of the distances that the codes decode to."
+        "colours are in the order of the distances that the codes decode to. The second network, a transformer, "
+        "samples such tokens one after another, each from probabilities that depend on those before it; the new scans "
+        "above are decoded from these."
     )
     return _Step(
         "Its tokens", text, _grid(colours, rows, columns) + _numbers(tokens[rows, columns], colours[rows, columns])
@@ -286,28 +286,24 @@ def _its_phases(demo: DemoPage) -> _Step:
 
 def _new_scans(demo: DemoPage) -> _Step:
     text = (
-        "The second network, a transformer, samples new tokens one after another, each from probabilities that depend "
-        "on the tokens before it. The decoders turn them into new scans, in the set <i>new</i>. All sets but the "
-        "first come from tokens in the same way, with a sampled return mask. Drag to turn the points, use the wheel to "
-        "zoom, and step through the scans with the arrows."
+        f"On the left are scans that were just generated. Beside each stands the {demo.kind} scan, of those trained on "
+        "here, that is nearest to it pixel by pixel: the two share a street's shape, and are no copies. Ground, walls "
+        "and lost rays look right; cars, poles and people are blurred, and few can be named. Drag to turn the points, "
+        "use the wheel to zoom, and step through the scans with the arrows."
     )
-    if len(demo.sets) > 3:
-        text += (
-            " The last set comes from the model in the package as a whole, all of whose networks were trained for "
-            "long: hours of one core."
-        )
     buttons = button("bin", ".bin") + button("ply", ".ply")
     return _Step("New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}."))
 
 
 def _scores(demo: DemoPage) -> _Step:
     text = (
-        f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many training scans; lower "
-        f"is better. Two bounds stand beside every score. <i>Real against real</i> (dashed line) is the score of one "
-        "half of the training scans against the other half: no model can be expected to do better. <i>Pixel "
-        "statistics</i> (square) is the score of scans each of whose pixels comes from another training scan, so that "
-        "no shape is left: any model should do better. Both are of half as many scans, and most metrics fall as sets "
-        "grow, so a good score may lie below real against real. The bar behind the dot is the 95 % interval."
+        f"Each metric measures how far {demo.card.samples.scans_used} new scans are from as many held-out scans, which "
+        "no network learned from; lower is better. Two bounds stand beside every score. <i>Real against real</i> "
+        "(dashed line) is the score of one half of the held-out scans against the other half: no model can be expected "
+        "to do better. <i>Pixel statistics</i> (square) is the score of scans each of whose pixels comes from another "
+        "held-out scan, so that no shape is left: any model should do better. Both are of half as many scans, and most "
+        "metrics fall as sets grow, so a good score may lie below real against real. The bar behind the dot is the "
+        "95 % interval. They cannot be compared with published tables."
     )
     return _Step("Scores of the new scans", text, score_table(demo.card))
 

@@ -54,7 +54,7 @@ _RAMPS = {
     },
 }
 _NO_RETURN = {"dark": (72, 81, 90), "light": (214, 220, 225)}
-_MEASURED = {"dark": (96, 165, 205), "light": (48, 104, 148)}
+_MEASURED = {"dark": (190, 198, 206), "light": (96, 106, 115)}
 _FILLED = {"dark": (255, 150, 40), "light": (214, 96, 0)}
 _UNKNOWN = {"dark": (140, 150, 160), "light": (110, 120, 130)}
 

@@ -35,6 +35,7 @@ def score_chart(score: Score) -> str:
     spoken = f"score {format_value(value)}"
     parts = [f'<line class="axis" x1="10" y1="{middle}" x2="{_WIDE - 10}" y2="{middle}"/>']
     parts.append(f'<line class="axis" x1="{x(0.0):.1f}" y1="{middle - 5}" x2="{x(0.0):.1f}" y2="{middle + 5}"/>')
+    parts.append(f'<text class="zero" x="{x(0.0):.1f}" y="{_TALL - 1}" text-anchor="middle">0</text>')
     if interval:
         spoken += f", 95 % interval {format_value(low)} to {format_value(high)}"
         parts.append(f'<line class="interval" x1="{x(low):.1f}" y1="{middle}" x2="{x(high):.1f}" y2="{middle}"/>')

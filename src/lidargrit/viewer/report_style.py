@@ -31,8 +31,12 @@ figcaption{font-size:.82rem;color:var(--soft);overflow-wrap:anywhere}
 .pair{display:grid;grid-template-columns:1fr 1fr;gap:4px 20px}
 .views{display:grid;grid-template-columns:1fr 1fr 1fr;gap:4px 20px;max-width:960px}
 @media (max-width:640px){.pair,.views{grid-template-columns:1fr}}
+@media (max-width:760px){.scores :is(table,tbody,tr,th,td){display:block;max-width:none}.scores thead{display:none}
+.scores :is(th,td){border:0;padding:2px 0}.scores tr{border-bottom:1px solid var(--line);padding:8px 0}
+.scores td[data-name]::before{content:attr(data-name) ": ";color:var(--soft)}.scores td.number{white-space:normal}}
 svg{max-width:100%;height:auto;color:var(--ink)}
 svg text{fill:var(--soft);font-size:12px}
+.zero{font-size:9px;fill:var(--soft)}
 .axis,.grid{stroke:var(--line);stroke-width:1.5}
 .interval{stroke:var(--a);stroke-width:6;stroke-opacity:.45;stroke-linecap:round}
 .real{stroke:var(--b);stroke-width:2.5;stroke-dasharray:4 3}

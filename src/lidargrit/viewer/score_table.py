@@ -30,7 +30,7 @@ def score_table(card: Scorecard) -> str:
     columns = "".join(f'<th scope="col">{head}</th>' for head in heads)
     return (
         f'<ul class="verdict">{sentences}</ul>'
-        '<div class="wide" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
+        '<div class="wide scores" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
         f"{columns}</tr></thead><tbody>{rows}</tbody></table></div>"
         + "".join(f"<p>{escape(note)}</p>" for note in notes_on_floors(card.scores))
     )
@@ -51,9 +51,10 @@ def _row(score: Score, columns: int) -> str:
     ]
     if columns == len(_HEADS):
         cells.append("not known" if pixels is None else format_value(pixels))
-    numbers = "".join(f'<td class="number">{cell}</td>' for cell in cells)
+    named = zip(_HEADS[1:], cells, strict=False)
+    numbers = "".join(f'<td class="number" data-name="{name}">{cell}</td>' for name, cell in named)
     better = "higher" if result.higher_is_better else "lower"
     return (
         f'<tr><th scope="row">{metric_title(result.metric, result.variant)}</th>{numbers}'
-        f"<td>{score_chart(score)}</td><td>{better}</td></tr>"
+        f'<td>{score_chart(score)}</td><td data-name="better">{better}</td></tr>'
     )

@@ -278,7 +278,8 @@ def files_of_others(root: Path) -> tuple[str, str] | None:
         return None
     most = counted.most_common(3)
     found = ", ".join(f"{count:,} {'file' if count == 1 else 'files'} {ending}" for ending, count in most)
-    return found, cures[most[0][0]]
+    ending = most[0][0]
+    return found, cures[ending] if len({*cures.values()}) == 1 else f"of {ending}: {cures[ending]}"
 
 
 def data_set_and_split(source: str) -> tuple[str, str]:

@@ -273,7 +273,7 @@ def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | Non
     elif _halved(columns) != columns:
         found.append(
             f"the sensor fires in {columns:,} columns; the file has {_halved(columns):,}, which networks can halve, so "
-            f"that some points share a pixel (--columns {columns} keeps them apart where a command takes it)"
+            f"that some points share a pixel (--set data.columns={columns} keeps them apart)"
         )
     if rings.method == "elevation clusters":
         found.append("the files do not tell which laser fired a point: rows are where elevations gather")

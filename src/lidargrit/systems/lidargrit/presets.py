@@ -221,9 +221,17 @@ PRESETS = {
         transformer=shared.DEMO_STAGES["transformer"],
     ),
     "lidargrit_demo_transformer": variant(
-        "LidarGRIT whose transformer alone is trained, demo: 64x256 in 256 tokens, for two CPU cores, four minutes",
+        "LidarGRIT whose transformer is trained further, demo: 64x256 in 256 tokens, for two CPU cores and a minute",
         _COMPACT_PIXELS,
-        {**_FOR_A_DEMO, "stages_from": "pretrained", "train_anew": ("transformer",)},
+        {
+            "data.train": ("simulated:96:train",),
+            "data.val": ("simulated:32:val",),
+            "training.transformer": replace(
+                _STAGES["transformer"], scans=160, learning_rate=6e-4, average_over_scans=40, **_FURTHER
+            ),
+            "stages_from": "pretrained",
+            "fine_tune": ("transformer",),
+        },
     ),
     "lidargrit_demo_fine_tuned": variant(
         "LidarGRIT trained further, demo: 64x256 in 256 tokens, for two CPU cores and four minutes",

@@ -1,5 +1,6 @@
 // The whole page: controls, keys, and the panes that follow them.
 
+const TURN_A_FRAME = 0.004; // a turn in half a minute
 const DENSE = 50000; // pixels of a scan whose points would cover one another if they were as large as those of others
 
 class Page {
@@ -97,6 +98,22 @@ class Page {
       keys[event.key]();
       this.redraw();
     }
+  }
+
+  // Turn by itself, until somebody takes hold of anything.
+  turn() {
+    let turning = !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+    for (const kind of ["pointerdown", "keydown", "wheel"]) {
+      window.addEventListener(kind, () => (turning = false), { once: true, capture: true });
+    }
+    const next = () => {
+      if (turning && this.panes.length > 0) {
+        this.camera.orbit(TURN_A_FRAME, 0);
+        this.redraw();
+        requestAnimationFrame(next);
+      }
+    };
+    requestAnimationFrame(next);
   }
 
   lookAgain() {

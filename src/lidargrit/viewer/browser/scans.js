@@ -10,6 +10,7 @@ class Source {
     this.rangeStepM = data.rangeStepM;
     this.endM = data.endM;
     this.classes = data.classes;
+    this.generated = data.name === "generated"; // by a model, every point
     this.columns = data.columnStride > 1 ? `, one in ${data.columnStride} columns` : "";
     this.data = data;
     this.unpacked = new Map();
@@ -124,6 +125,7 @@ function coloursOf(source, scan, points, look) {
   const colours = new Uint8ClampedArray(4 * scan.count).fill(255);
   const ramp = look.ramps[look.mode];
   const position = ["label", "filled"].includes(look.mode) ? null : POSITIONS[look.mode](source, scan, points, look.scales[look.mode]);
+  const height = POSITIONS.height(source, scan, points, look.scales.height); // shades what has one colour
   const classOf = look.mode === "label" && scan.label && ((pixel) => source.classes[scan.label[pixel]].colour);
   for (let pixel = 0; pixel < scan.count; pixel++) {
     let colour = look.unknown;
@@ -133,7 +135,8 @@ function coloursOf(source, scan, points, look) {
       const step = Math.round(Math.min(1, Math.max(0, position(pixel))) * (ramp.length - 1));
       colour = ramp[step] ?? look.unknown;
     } else if (look.mode === "filled") {
-      colour = scan.filled?.[pixel] ? look.filled : look.measured;
+      const share = Math.min(1, Math.max(0, height(pixel)));
+      colour = (source.generated || scan.filled?.[pixel] ? look.filled : look.measured).map((part) => (0.5 + 0.5 * share) * part);
     } else if (classOf) {
       colour = classOf(pixel);
     }

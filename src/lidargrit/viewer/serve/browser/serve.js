@@ -2,7 +2,6 @@
 
 const PANES_AT_MOST = 4; // more are too small to see anything in
 const ASK_AGAIN_MS = 300;
-const TURN_A_FRAME = 0.004; // a turn in half a minute
 const el = (id) => document.getElementById(id);
 
 // A pane whose files the server writes, by the same code as `lidargrit export`.
@@ -107,24 +106,7 @@ class Desk {
     el("count").value = "1";
     await this.submit(null, () => this.generate());
     el("count").value = "3";
-    if (this.page && !window.matchMedia("(prefers-reduced-motion: reduce)").matches) {
-      this.turn();
-    }
-  }
-
-  turn() {
-    let turning = true;
-    for (const kind of ["pointerdown", "keydown", "wheel"]) {
-      window.addEventListener(kind, () => (turning = false), { once: true, capture: true });
-    }
-    const next = () => {
-      if (turning && this.page.panes.length > 0) {
-        this.page.camera.orbit(TURN_A_FRAME, 0);
-        this.page.redraw();
-        requestAnimationFrame(next);
-      }
-    };
-    requestAnimationFrame(next);
+    this.page?.turn();
   }
 
   chooseExample(name) {
@@ -288,7 +270,8 @@ class Desk {
         "with raydrop": `raydrop by ${by}`,
         reconstructed: `reconstructed by ${by}`,
       }[source.name];
-      return new ServedPane(new Source({ ...source, name: name ?? source.name }), this.page, job, group, data.scales);
+      const shown = Object.assign(new Source(source), { name: name ?? source.name });
+      return new ServedPane(shown, this.page, job, group, data.scales);
     });
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
     fresh.at(-1).element.scrollIntoView({ block: "nearest" }); // on a small screen the form lies below
