@@ -133,6 +133,9 @@ class Pane {
     const { cloud } = this.part;
     const dense = window.devicePixelRatio || 1;
     const [width, height] = [Math.round(cloud.clientWidth * dense), Math.round(cloud.clientHeight * dense)];
+    if (width === 0 || height === 0) {
+      return; // not laid out yet, or hidden
+    }
     if (cloud.width !== width || cloud.height !== height) {
       [cloud.width, cloud.height] = [width, height];
     }
