@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.pixel_decoder import phase_noise
-from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
+from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise, following
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_phases import Phase, phases_of
 from lidargrit.scans.types import RangeImage
@@ -187,3 +187,18 @@ def test_training_learns_the_noise_of_masks_and_sampling_follows_it() -> None:
 def test_a_negative_correlation_of_masks_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"mask_correlation=-1\.0"):
         PixelSampling(mask_correlation=-1.0)
+
+
+def test_numbers_of_neighbouring_columns_correlate_and_stay_uniform():
+    rng = torch.Generator().manual_seed(0)
+    own = [torch.rand((64, 512), generator=rng) for _ in range(4)]
+    found = [following(own[at], own[:at]) for at in range(4)]
+    assert torch.equal(found[0], own[0]), "the first image is as it is alone"
+    normal = torch.stack([torch.special.ndtri(one.double()).flatten() for one in found])
+    wanted = 0.6 ** (torch.arange(4)[:, None] - torch.arange(4)).abs().double()
+    assert torch.corrcoef(normal).numpy() == pytest.approx(wanted.numpy(), abs=0.015)
+    for one in found:
+        assert float(one.min()) >= 0
+        assert float(one.max()) < 1
+        ends = torch.linspace(0, 1, 11)
+        assert torch.histogram(one.flatten(), ends).hist.numpy() == pytest.approx(64 * 51.2, rel=0.06)

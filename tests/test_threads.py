@@ -7,8 +7,12 @@ import sys
 import pytest
 import torch
 
+from lidargrit.generation.generator import load
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.scans.projection import project
+from lidargrit.scans.types import RangeImage
+from lidargrit.simulator import simulate
 
 ASK = """
 import os, sys
@@ -59,3 +63,18 @@ def test_small_steps_are_not_shared_by_threads_that_spin(policy, width, expected
         assert torch.get_num_threads() == 3
     finally:
         torch.set_num_threads(before)
+
+
+def test_two_threads_move_decoded_ranges_by_less_than_a_millimetre():
+    model, before = load("pretrained"), torch.get_num_threads()
+    images = RangeImage.stack([project(simulate(0), model.sensor)])
+    found = []
+    try:
+        for number in (1, 2):
+            torch.set_num_threads(number)
+            found.append(model.reconstruct(images))
+    finally:
+        torch.set_num_threads(before)
+    both = found[0].return_mask & found[1].return_mask
+    assert (found[0].return_mask == found[1].return_mask).float().mean() > 0.9999
+    assert float((found[0].range_m - found[1].range_m)[both].abs().max()) < 1e-3

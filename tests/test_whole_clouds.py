@@ -180,6 +180,27 @@ def test_each_dropped_point_follows_its_pixel_or_the_nearest_ray():
         assert bool(done.kept[point]) == bool(returned[row, column])
 
 
+def test_drops_of_neighbouring_columns_hang_together_at_the_same_rate():
+    model, scan = network(Raydrop), unproject(street(DENSE.fine()))
+    seen = Drop().see(scan, model)
+    condition, seeds = Drop().condition(seen, 0), seen.rays.seeds(0)
+    alone = model.complete(condition, seeds).return_mask
+    together = model.complete(seen.rays.beside_one_another(condition, seeds), seeds).return_mask
+    assert torch.equal(alone[0], together[0]), "the first image is what the model makes of it alone"
+    surface = condition.range_observed
+    both = surface[1:] & surface[:-1]
+
+    def shared(mask):  # the share of surfaces whose drop is that of the column before
+        return float((mask[1:] == mask[:-1])[both].float().mean())
+
+    assert shared(together) > shared(alone) + 0.05
+    assert float(together[surface].float().mean()) == pytest.approx(float(alone[surface].float().mean()), abs=0.03)
+    assert torch.equal(
+        complete_scan(scan, model, Drop(), 0).kept,
+        Drop().result(seen, condition, model.complete(seen.rays.beside_one_another(condition, seeds), seeds)).kept,
+    )
+
+
 def test_upsample_keeps_every_point_and_adds_rows_between():
     scan = unproject(street(SIXTEEN))
     dense = load_sensor("pandar64").with_columns(128)

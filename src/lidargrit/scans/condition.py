@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Int64, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
@@ -80,6 +80,8 @@ class Observed(Condition):
         return_observed: True where it is known whether the beam came back.
         sensor: sensor whose rays the pixels are.
         planes: further planes of the observed surfaces or returns, by names of :data:`~lidargrit.scans.types.PLANES`.
+        earlier_seeds: seeds of the images whose columns lie before those of each image in one scan, the nearest last,
+            and -1 for none; None where the images are scans of their own. Drops of neighbouring columns depend on them.
 
     Raises:
         ConfigError: masks or planes of another size or type than the ranges, or no batch.
@@ -93,6 +95,7 @@ class Observed(Condition):
     return_observed: Bool[Tensor, "B H W"]
     sensor: SensorModel
     planes: Mapping[str, Shaped[Tensor, "B H W"]] = field(default_factory=dict)
+    earlier_seeds: Int64[Tensor, "B K"] | None = None
 
     def __post_init__(self) -> None:
         _check_mask(self.range_observed, self.range_m)
@@ -157,6 +160,7 @@ class Observed(Condition):
             torch.cat([one.return_observed for one in parts]),
             sensor_of_all([one.sensor for one in parts]),
             common_planes([one.planes for one in parts], torch.cat),
+            _all_or_none([one.earlier_seeds for one in parts]),
         )
 
     def __len__(self) -> int:
@@ -178,6 +182,7 @@ class Observed(Condition):
             return_mask=change(self.return_mask),
             return_observed=change(self.return_observed),
             planes={name: change(pixels) for name, pixels in self.planes.items()},
+            earlier_seeds=None if self.earlier_seeds is None else change(self.earlier_seeds),
         )
 
     @property
@@ -231,6 +236,11 @@ class Observed(Condition):
         if generated.reflectance is not None and not bool(observed["reflectance"].any()):
             planes.setdefault("reflectance", generated.reflectance)
         return RangeImage.masked(range_m, returned, self.sensor, planes)
+
+
+def _all_or_none(parts: Sequence[Int64[Tensor, "b K"] | None]) -> Int64[Tensor, "B K"] | None:
+    known = [part for part in parts if part is not None]
+    return torch.cat(known) if len(known) == len(parts) else None
 
 
 def _check_mask(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:

@@ -16,6 +16,7 @@ _TERMS = 4  # of the series, whose error is below 2 % up to a correlation of 0.5
 _HALF_LIFE_SCANS = 200  # of the sums of a phase, in scans of which it was taken
 _PRIOR = 10.0  # as if about a hundred uncertain pairs had been seen without any correlation
 _MOST = 0.9  # of the noise that is shared; the rest decides each pixel alone
+_OF_NEXT_COLUMN = 0.6  # correlation with the numbers of the column before, where a scan is several images
 _LEAST = 1e-6  # of a probability, so that its quantile is finite
 
 
@@ -107,6 +108,24 @@ class PhaseNoise(nn.Module):
             mixed = mixed + math.sqrt(down) * (_root(height, wraps=False) @ rows)
             normal[phase.pixels] = mixed + math.sqrt(along) * (columns @ _root(width, wraps=True).T)
         return torch.special.ndtr(normal).to(uniform.dtype).clamp(max=1 - torch.finfo(uniform.dtype).eps)
+
+
+def following(own: Float[Tensor, "H W"], before: Sequence[Float[Tensor, "H W"]]) -> Float[Tensor, "H W"]:
+    """Return uniform numbers of an image that correlate with those of the images of the columns before.
+
+    The normal numbers of neighbouring columns are an autoregression, whose distribution in each image is that of its
+    own numbers.
+
+    Args:
+        own: numbers in [0, 1) of the image.
+        before: numbers of the earlier images, the nearest last, each drawn without regard to the others.
+    """
+    if not before:
+        return own
+    normal, *later = (torch.special.ndtri(one.double().clamp(_LEAST, 1 - _LEAST)) for one in (*before, own))
+    for one in later:
+        normal = _OF_NEXT_COLUMN * normal + math.sqrt(1 - _OF_NEXT_COLUMN**2) * one
+    return torch.special.ndtr(normal).to(own.dtype).clamp(max=1 - torch.finfo(own.dtype).eps)
 
 
 def _hermite_factors(logits: Float64[Tensor, "*P"], returned: Bool[Tensor, "*P"]) -> Float64[Tensor, "F *P"]:

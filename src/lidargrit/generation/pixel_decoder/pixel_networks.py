@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
@@ -14,7 +14,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
 from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
-from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
+from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise, following
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,
@@ -25,6 +25,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     phases_of,
 )
 from lidargrit.nn.precision import at_least_32_bits
+from lidargrit.nn.random import rngs_of
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
@@ -236,11 +237,24 @@ class MaskNetwork(PhaseNetwork):
             certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), lattice))
         return torch.cat((certain * returned, certain * (1 - returned)), 2)
 
-    def uniform(self, rngs: Sequence[torch.Generator]) -> Float[Tensor, "B H W"]:
-        """Return random numbers for one mask of each generator, correlated as learned, on the device of the network."""
-        size, shares = (self.sensor.height, self.sensor.width), self.noise.shares()
-        numbers = [self.noise(torch.rand(size, generator=rng), rng, shares) for rng in rngs]
+    def uniform(
+        self, rngs: Sequence[torch.Generator], earlier_seeds: Int64[Tensor, "B K"] | None = None
+    ) -> Float[Tensor, "B H W"]:
+        """Return random numbers for one mask of each generator, correlated as learned, on the device of the network.
+
+        Args:
+            earlier_seeds: seeds of images whose columns lie before those of each image, the nearest last, and -1 for
+                none; their numbers then correlate with its own.
+        """
+        numbers = [self._uniform_of(rng) for rng in rngs]
+        for at, seeds in enumerate([] if earlier_seeds is None else earlier_seeds.tolist()):
+            before = [self._uniform_of(rng) for rng in rngs_of([seed for seed in seeds if seed >= 0])]
+            numbers[at] = following(numbers[at], before)
         return torch.stack(numbers).to(self.row_bias.device)
+
+    def _uniform_of(self, rng: torch.Generator) -> Float[Tensor, "H W"]:
+        uniform = torch.rand((self.sensor.height, self.sensor.width), generator=rng)
+        return self.noise(uniform, rng, self.noise.shares())
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.

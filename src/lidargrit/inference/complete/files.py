@@ -200,8 +200,9 @@ def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
 
 def _completed(model: Model, jobs: Sequence[_Job], seed: int) -> list[RangeImage]:
     """Return what a model makes of each scan: a batch of the images that the scan consists of."""
-    seeds = [one for job in jobs for one in job.scan.rays.seeds(seed + job.turn, job.number)]
-    images = complete_images(model, Observed.cat([job.condition for job in jobs]), seeds)
+    of_jobs = [(job.scan.rays, job.condition, job.scan.rays.seeds(seed + job.turn, job.number)) for job in jobs]
+    condition = Observed.cat([rays.beside_one_another(known, seeds) for rays, known, seeds in of_jobs])
+    images = complete_images(model, condition, [one for *_, seeds in of_jobs for one in seeds])
     ends = list(accumulate(job.scan.rays.phases for job in jobs))
     return [images[end - job.scan.rays.phases : end] for job, end in zip(jobs, ends, strict=True)]
 

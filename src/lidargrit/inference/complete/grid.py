@@ -4,8 +4,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from lidargrit.core.determinism import derive_seed, scan_seed
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection.sensor_check import known_rings
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
 from lidargrit.scans.types import RangeImage, Scan
@@ -64,6 +66,12 @@ class RayGrid:
     def seeds(self, *parts: int) -> list[int]:
         """Return a seed for each image; that of the first is the seed of the model's image alone."""
         return [scan_seed(*parts, at) if at else scan_seed(*parts) for at in range(self.phases)]
+
+    def beside_one_another(self, condition: Observed, seeds: list[int]) -> Observed:
+        """Return the condition of the images of one scan, told the seeds of the images of the columns before."""
+        unknown = len(seeds) - 1
+        earlier = [[*[-1] * (unknown - at), *seeds[:at]] for at in range(len(seeds))]
+        return replace(condition, earlier_seeds=torch.tensor(earlier, dtype=torch.int64)) if unknown else condition
 
 
 def phase_seed(seed: int, phase: int) -> int:

@@ -181,8 +181,9 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
     """
     task = task or Fill(Pattern("returns"))
     seen = task.see(scan, model)
-    condition = task.condition(seen, derive_seed(seed))
-    return task.result(seen, condition, complete_images(model, condition, seen.rays.seeds(seed)))
+    seeds = seen.rays.seeds(seed)
+    condition = seen.rays.beside_one_another(task.condition(seen, derive_seed(seed)), seeds)
+    return task.result(seen, condition, complete_images(model, condition, seeds))
 
 
 def complete_images(model: Model, condition: Observed, seeds: list[int]) -> RangeImage:

@@ -140,7 +140,7 @@ class RaydropNetwork(nn.Module):
             condition: surfaces of as many scans: the range of every ray that meets one, and no return for all other
                 rays.
         """
-        images, uniform = [], self.mask.uniform(rngs)
+        images, uniform = [], self.mask.uniform(rngs, condition.earlier_seeds)
         for index in range(len(rngs)):
             one = condition[index : index + 1]
             found = self(one.range_m, one.range_observed, one.label)
