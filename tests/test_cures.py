@@ -1,6 +1,7 @@
 """What a message tells to type: every verb that reads scans takes each option that its messages name, and guesses."""
 
 import ast
+import json
 import re
 from pathlib import Path
 
@@ -159,3 +160,11 @@ def test_a_run_refuses_another_sensor_and_other_columns_with_a_cure_that_works(v
     typed = cure[1].replace("SCANS", str(scans / "few_rings")).replace("SEEN", seen)
     assert main(typed.split()) == 0
     assert main([word.replace(str(scans / "few_rings"), seen) for word in (*words, "-n", "1")]) == 0
+
+
+def test_the_cure_for_a_sensor_of_a_file_names_that_file(scans, tmp_path, capsys):
+    mine = tmp_path / "my sensor.json"
+    mine.write_text(json.dumps({**load_sensor("vlp16").to_json(), "name": "mine"}))
+    assert main(["compress", str(scans / "few_rings"), str(tmp_path / "a.lgz"), "--sensor", str(mine)]) == 2
+    told = capsys.readouterr().err
+    assert f"rescan SCANS SEEN --sensor '{mine}' --to hdl64e_kitti_odometry" in told

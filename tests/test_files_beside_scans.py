@@ -10,7 +10,7 @@ from PIL import Image
 from lidargrit.cli import main
 from lidargrit.core.errors import DataError, ScanError
 from lidargrit.data.datasets import open_dataset
-from lidargrit.data.formats import cure_of_ending, read_scan
+from lidargrit.data.formats import cure_of_ending, is_of_other_program, read_scan
 from street_corner import corner, xyz_of
 
 TABLE = corner()
@@ -105,10 +105,15 @@ def test_poses_times_and_remarks_beside_scans_are_not_called_scans(tmp_path):
         "calib": "Tr: 1 0 0\n",
         "README": "8 scans of a drive\n",
         "timestamps": "2011-09-26 13:02:25.964389445\n",
+        "tum": "".join(f"{at / 10} {at} 0 0 0 0 0 1\n" for at in range(9)),
+        "gps": "".join(f"{1326030975.7 + at} 42.29 -83.71 270.1\n" for at in range(9)),
+        "gps_from_0": "".join(f"{at / 10:.1f},42.29,-83.71,270.1\n" for at in range(9)),
     }.items():
         (tmp_path / f"{name}.txt").write_text(text)
     assert open_dataset(str(tmp_path)).notes == ()
-    (tmp_path / "cloud.txt").write_text("-1.5e+00, 2, 0.3 , 17\n1 2 3 4\n")
+    for first in ("0 0 0 0\n0 1 2 3\n", "4571234.5 1 2\n4571235.5 1 2\n", "-1.5e+00, 2, 0.3 , 17\n1 2 3 4\n"):
+        (tmp_path / "cloud.txt").write_text(first)
+        assert is_of_other_program(tmp_path / "cloud.txt")
     assert open_dataset(str(tmp_path)).notes[0].startswith("1 file .txt beside 1 that are read left out; put a line")
     for name in ("b.laz", "c.laz"):
         (tmp_path / name).write_bytes(b"LASF")

@@ -1,5 +1,6 @@
 """Files that leave out, or write differently, what their formats leave open: read rightly, and no damage."""
 
+from contextlib import suppress
 from io import BytesIO
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ScanError
+from lidargrit.data.datasets.shared.files import is_recognised
 from lidargrit.data.formats import read_scan
 from lidargrit.data.sources import open_source
 from lidargrit.scans.projection import closest_sensor
@@ -175,6 +177,26 @@ def test_arrays_by_name_by_column_and_organised(tmp_path):
         np.savez(tmp_path / f"{name}.npz", **points, reflectance=bare[:, 3:])
         check(tmp_path / f"{name}.npz")
         assert open_source(str(tmp_path / f"{name}.npz")).kind == "scans"
+
+
+def test_one_array_of_another_name_is_a_scan_only_if_it_has_rows_of_points(tmp_path):
+    for name, array in {"K": np.eye(3), "pose": np.eye(4), "image": np.zeros((20, 30, 3)), "t": np.zeros(90)}.items():
+        np.savez(tmp_path / "a.npz", **{name: array})
+        assert not is_recognised(tmp_path / "a.npz"), name
+        with pytest.raises(ScanError, match=f"holds the arrays '{name}'.*call the array of points 'points'"):
+            read_scan(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", K=np.tile([[3.0, 4.0, 5.0]], (16, 1)))
+    assert is_recognised(tmp_path / "a.npz")
+    assert len(read_scan(tmp_path / "a.npz")) == 16
+
+
+def test_files_of_carla_with_fewer_than_two_points_are_read_without_a_warning(tmp_path, recwarn):
+    for count in (0, 1):
+        rows = {axis: np.ones(count, np.float32) for axis in "xyz"}
+        np.savez(tmp_path / "a.npz", **rows, cosangle=np.ones(count))
+        with suppress(ScanError):
+            assert len(read_scan(tmp_path / "a.npz")) == count
+    assert not recwarn.list
 
 
 def test_a_fourth_column_of_rings_is_no_reflectance(tmp_path):

@@ -108,7 +108,7 @@ def test_muon_takes_the_kernels_of_blocks_as_matrices_of_one_row_a_channel(layou
         if weight.ndim == 4:
             matrix = nn.Parameter(before[name].flatten(1).clone())
             matrix.grad = gradients[name].flatten(1)
-            Muon([matrix], lr=0.1, weight_decay=0.0, adjust_lr_fn="match_rms_adamw").step()
+            Muon([matrix], lr=0.1, weight_decay=0.0).step()
             step = (matrix - before[name].flatten(1)).abs().max()
             # Perhaps in bfloat16, and with the columns in another order.
             assert (weight.flatten(1) - matrix).abs().max() < 0.02 * step
@@ -120,7 +120,7 @@ def test_a_step_of_muon_is_that_of_a_loop_over_singular_values(shape, monkeypatc
     rng = np.random.default_rng(0)
     start, gradients = rng.normal(size=shape), rng.normal(size=(3, *shape))
     weight, wanted, average = nn.Parameter(torch.tensor(start).float()), start.copy(), np.zeros(shape)
-    optimiser = Muon([weight], lr=0.1, weight_decay=0.3, adjust_lr_fn="match_rms_adamw")
+    optimiser = Muon([weight], lr=0.1, weight_decay=0.3)
     for gradient in gradients:
         weight.grad = torch.tensor(gradient).float()
         optimiser.step()

@@ -18,13 +18,15 @@ _END_BYTES, _END_BYTES_64 = 22, 20  # of the records that end an archive; the se
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
-def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
-    """Return the array in the bytes of an .npy file; it shares their memory.
+def parse_header(file: BytesIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return the shape of an .npy file's array, whether it lies column by column, and the type of its numbers.
+
+    Args:
+        file: bytes from the first on, which are read up to the numbers.
 
     Raises:
-        ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
+        ValueError: a damaged header.
     """
-    file = BytesIO(data)
     try:
         version = np.lib.format.read_magic(file)
         size_bytes = 2 if version == (1, 0) else 4
@@ -34,9 +36,19 @@ def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
         file.seek(-size_bytes, 1)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
-            shape, by_column, dtype = read(file, max_header_size=HEADER_BYTES_AT_MOST)
+            return read(file, max_header_size=HEADER_BYTES_AT_MOST)
     except Exception as error:  # a damaged header is met with errors of many kinds
         raise ValueError(f"a damaged array ({first_words(error)})") from None
+
+
+def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
+    """Return the array in the bytes of an .npy file; it shares their memory.
+
+    Raises:
+        ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
+    """
+    file = BytesIO(data)
+    shape, by_column, dtype = parse_header(file)
     # True is an int to numpy's reader, but not to those that then use the shape.
     plain = all(type(size) is int and size >= 0 for size in shape)
     fields = [of_field for of_field, *_ in dtype.fields.values()] if may_have_fields and dtype.fields else [dtype]
@@ -91,6 +103,23 @@ def read_member(
     except Exception as error:  # a damaged archive is met with errors of many kinds
         raise ValueError(f"a damaged array ({first_words(error)})") from None
     return parse_array(data, may_have_fields)
+
+
+def member_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
+    """Return the shape of one array of an archive and the type of its numbers, which are not unpacked.
+
+    Raises:
+        ValueError: it is packed by another method than numpy's, or is damaged.
+    """
+    if info.compress_type not in _PACKED:
+        raise ValueError(f"an array packed by method {info.compress_type}")
+    try:
+        with archive.open(info) as file:
+            data = file.read(2 * HEADER_BYTES_AT_MOST)
+    except Exception as error:  # a damaged archive is met with errors of many kinds
+        raise ValueError(f"a damaged array ({first_words(error)})") from None
+    shape, _, dtype = parse_header(BytesIO(data))
+    return shape, dtype
 
 
 def read_arrays(

@@ -1,10 +1,11 @@
 """Muon: the gradient of a matrix → an orthogonal step, in a number type that this machine computes in."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidargrit.nn.precision import dtype_of
 
@@ -13,12 +14,16 @@ class Muon(torch.optim.Muon):
     """torch's Muon, in 32 bits on machines without instructions for bfloat16.
 
     torch orthogonalises in bfloat16 everywhere. A processor that only imitates bfloat16 then spends nine tenths of a
-    step of training there. Settings and state are those of torch's Muon, so checkpoints fit both.
+    step of training there. Settings and state are those of torch's Muon, so checkpoints fit both. The momentum is
+    always Nesterov's, and a step is as large as AdamW's, so that one learning rate suits both optimisers.
 
     Source:
         Jordan et al., Muon: An optimizer for hidden layers in neural networks, 2024; the step's size is that of
         Liu et al., Muon is Scalable for LLM Training, 2025.
     """
+
+    def __init__(self, matrices: Iterable[nn.Parameter], lr: float, weight_decay: float) -> None:
+        super().__init__(matrices, lr, weight_decay, nesterov=True, adjust_lr_fn="match_rms_adamw")
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]

@@ -44,12 +44,7 @@ def make_optimiser(objective: nn.Module, config: TrainingConfig) -> torch.optim.
             "leave the stage's optimiser out: adamw is the default",
         )
     with _as_matrices(matrices):
-        muon = Muon(
-            matrices,
-            lr=config.learning_rate,
-            weight_decay=config.weight_decay,
-            adjust_lr_fn="match_rms_adamw",  # so that one learning rate suits both optimisers
-        )
+        muon = Muon(matrices, config.learning_rate, config.weight_decay)
     return _Together([muon, adamw], matrices)
 
 

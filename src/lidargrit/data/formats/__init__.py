@@ -6,6 +6,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from io import BufferedReader
+from itertools import pairwise
 from pathlib import Path
 from typing import ClassVar
 
@@ -33,8 +34,10 @@ _CURES = {  # by the ending, for files that hold scans but are not read
     (".bag.active",): "finish it with: rosbag reindex",
     (".e57", ".ptx", ".pcd.lz4", ".rosbag"): "convert it to .pcd or .ply, for instance with CloudCompare",
 }
-_LINE_BYTES = 400
-_LINE_OF_A_POINT = re.compile(rb"\s*(?:[-+.\d][-+.\deE]*[ \t,;]+){2,7}[-+.\d][-+.\deE]*[ \t]*\r?(?:\n|\Z)")
+_LINES_BYTES = 400
+_SINCE_AN_EPOCH = 1e8  # seconds or their parts; no coordinate is as large, of a map either
+_LINE_OF_A_POINT = re.compile(rb"\s*(?:[-+.\d][-+.\deE]*[ \t,;]+){2,6}[-+.\d][-+.\deE]*[ \t]*\r?(?:\n|\Z)")
+_BETWEEN_NUMBERS = re.compile(rb"[ \t,;]+")
 POINTS_AT_MOST = 4_000_000  # thirty revolutions of an HDL-64E; a larger file is a map, or no scan at all
 
 
@@ -176,11 +179,27 @@ def cure_of_ending(path: Path) -> str:
 
 
 def is_of_other_program(path: Path) -> bool:
-    """Return whether a file is called like scans that we do not read; poses, times and remarks (.txt) are none."""
+    """Return whether a file is called like scans that we do not read.
+
+    A ``.txt`` is one if its first line has 3 to 7 numbers, and if its lines do not begin with times: numbers that rise
+    from line to line, from 0 or as large as seconds since an epoch. So are no poses (7 numbers and a time, or 12),
+    times, places by GPS, and remarks.
+    """
     name = path.name.lower()
     if name.endswith(".txt"):
-        return bool(_LINE_OF_A_POINT.match(first_bytes(path, _LINE_BYTES)))
+        lines = first_bytes(path, _LINES_BYTES)
+        return bool(_LINE_OF_A_POINT.match(lines)) and not _begin_with_times(lines)
     return name.endswith(tuple(ending for endings in _CURES for ending in endings))
+
+
+def _begin_with_times(lines: bytes) -> bool:
+    words = (_BETWEEN_NUMBERS.split(line.strip(), 1)[0] for line in lines.split(b"\n")[:-1])  # the last may be cut
+    try:
+        times = [float(word) for word in words if word]
+    except ValueError:
+        return False
+    rise = all(before < after for before, after in pairwise(times))
+    return len(times) > 1 and rise and (times[0] == 0 or times[0] > _SINCE_AN_EPOCH)
 
 
 def read_scan(path: Path | str, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:

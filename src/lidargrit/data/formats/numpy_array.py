@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array
+from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array, parse_header
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import BadPoints, damaged, first_bytes, open_file, read_bytes
-from lidargrit.data.formats.shared.archive import ROWS, WIDTHS, are_points, columns_of_archive, columns_of_rows
+from lidargrit.data.formats.shared.archive import ROWS, WIDTHS, columns_of_archive, columns_of_rows, has_points
 from lidargrit.data.formats.shared.carla import right_handed
 from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, ColumnFormat, scan_of_columns
 from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_marks
@@ -27,10 +27,10 @@ class NumpyArray(ColumnFormat):
 
     An ``.npy`` holds a row of x, y, z for every point, and reflectance and ring if the rows are longer; a fourth number
     that keeps to one elevation is the ring. Rows of named numbers, organised clouds (H, W, 3) and arrays by column
-    (3, n) are taken, too. An ``.npz`` holds such rows as ``points`` (or xyz), as x, y and z, or as the one array whose
-    name is no column of points, and if they are there reflectance (or reflectivity, intensity, remission, i), ring (or
-    channel) and label as arrays of their own. The ``.npy`` of a scan with rings but without reflectance
-    is given a reflectance of 0.
+    (3, n) are taken, too. An ``.npz`` holds such rows as ``points`` (or xyz), or as x, y and z. It may also hold them
+    as the one array whose name is no column of points, if it has at least 16 rows of 3 to 5 numbers. Reflectance (or
+    reflectivity, intensity, remission, i), ring (or channel) and label lie beside them as arrays of their own. The
+    ``.npy`` of a scan with rings but without reflectance is given a reflectance of 0.
     """
 
     title = "NumPy array (.npz, .npy)"
@@ -43,7 +43,7 @@ class NumpyArray(ColumnFormat):
             return True
         try:
             with open_file(path, _FORMAT) as file, _archive(file, path) as archive:
-                return are_points([name.removesuffix(".npy") for name in archive.namelist()])
+                return has_points(archive)
         except (ScanError, OSError):
             return False
 
@@ -87,13 +87,9 @@ class NumpyArray(ColumnFormat):
 
 def holds_points(path: Path) -> bool:
     """Return whether the header of an ``.npy`` is of points: rows of named numbers, or 3 to 5 numbers in each."""
-    file = BytesIO(first_bytes(path, 2 * HEADER_BYTES_AT_MOST))
     try:
-        read = np.lib.format.read_array_header_1_0
-        if np.lib.format.read_magic(file) != (1, 0):
-            read = np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file, max_header_size=HEADER_BYTES_AT_MOST)
-    except Exception:  # told where it is read
+        shape, _, dtype = parse_header(BytesIO(first_bytes(path, 2 * HEADER_BYTES_AT_MOST)))
+    except ValueError:  # told where it is read
         return True
     if dtype.names:
         return {*"xyz"} <= {name.lower() for name in dtype.names}

@@ -1,5 +1,7 @@
 """A source and the sensor that a user named → the sensor whose rays its scans lie on."""
 
+import shlex
+
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import ScanSettings
@@ -21,19 +23,27 @@ def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample")
     own = RunSource(model, locate(model, job)).sensor
     sensor = settings.load_sensor() or settings.data.imaged(own.fine())
     if not own.same_rays(sensor):
-        raise other_sensor(sensor, own, model)
+        raise other_sensor(sensor, own, model, settings.sensor)
 
 
-def other_sensor(sensor: SensorModel, own: SensorModel, model: str) -> ConfigError:
-    """Return the message about a sensor that was named for the scans of a run of another one."""
+def other_sensor(sensor: SensorModel, own: SensorModel, model: str, typed: str = "") -> ConfigError:
+    """Return the message about a sensor that was named for the scans of a run of another one.
+
+    Args:
+        typed: name or ``.json`` file by which the user named the sensor; "" if that is not known.
+    """
     if sensor.name == own.name:
         cure = "name a run of these columns with --model, or leave the columns out"
     else:
-        to = own.name if own.name in discovery.names("sensors") else "SENSOR.json"
-        seen = f"lidargrit rescan SCANS SEEN --sensor {sensor.name} --to {to}"
+        by = shlex.quote(typed) if typed else _to_type(sensor)
+        seen = f"lidargrit rescan SCANS SEEN --sensor {by} --to {_to_type(own)}"
         cure = f"name a run of that sensor with --model, or first: {seen}, and take SEEN without --sensor"
     return ConfigError(
         f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for --model {model}",
         f"its own, {own.name!r}, {own.height}x{own.width}",
         cure,
     )
+
+
+def _to_type(sensor: SensorModel) -> str:
+    return sensor.name if sensor.name in discovery.names("sensors") else "SENSOR.json"

@@ -1,12 +1,12 @@
 """Arrays of a scan, one with rows of points and others beside it, as NumPy and HDF5 files hold them → columns."""
 
 import zipfile
-from collections.abc import Collection
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, read_member
+from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, member_header, read_member
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import POINTS_AT_MOST
 from lidargrit.data.formats.shared.columns import BYTES_AT_MOST
@@ -21,13 +21,19 @@ ROWS = ("x", "y", "z", "intensity", "ring")
 _IMAGE = "range_m"  # of samples, which lie in a folder with what tells their rays
 _VALUE_BYTES_AT_MOST = 16  # numpy's widest number
 _POINTS_FOR_RINGS, _RINGS_AT_MOST = 100, 256
+_ROWS_AT_LEAST = 16  # of an array that is not called points: matrices of cameras and poses have fewer
 _WITHIN_RINGS = 0.05  # share of the elevations' variance; reflectance of whole numbers leaves nearly all of it
 
 
-def are_points(names: Collection[str]) -> bool:
-    """Return whether arrays of these names are points: one called so, x, y and z, or one that is no column."""
-    axes = {*"xyz"} <= {name.lower() for name in names}
-    return axes or (_IMAGE not in names and bool(_points_name(names)))
+def has_points(archive: zipfile.ZipFile) -> bool:
+    """Return whether an archive has points: an array called so, x, y and z, or one that is no column and looks so.
+
+    Raises:
+        ValueError: that one array is damaged.
+    """
+    members = _members(archive)
+    axes = {*"xyz"} <= {name.lower() for name in members}
+    return axes or (_IMAGE not in members and bool(_points_name(archive, members)))
 
 
 def columns_of_archive(archive: zipfile.ZipFile, path: Path, wanted: str) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -36,9 +42,9 @@ def columns_of_archive(archive: zipfile.ZipFile, path: Path, wanted: str) -> tup
     Args:
         wanted: description of a good file, for messages.
     """
-    members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    there, points_name, columns = [*members], _points_name(members), dict[str, np.ndarray]()
-    if not are_points(members):
+    members = _members(archive)
+    there, points_name, columns = [*members], _points_name(archive, members), dict[str, np.ndarray]()
+    if not has_points(archive):
         if _IMAGE in members:
             got, cure = "a range image from a folder of samples", f"name the whole folder: {path.absolute().parent}"
         else:
@@ -95,10 +101,21 @@ def columns_of_rows(rows: np.ndarray, path: Path, wanted: str) -> dict[str, np.n
     return dict(zip(names, columns, strict=False))
 
 
-def _points_name(names: Collection[str]) -> str:
-    """Return the array of points: by its name, else the only one whose name is no column of points; "" if neither."""
-    others = [name for name in names if not known_name(name)]
-    return next((name for name in POINTS if name in names), others[0] if len(others) == 1 else "")
+def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+
+
+def _points_name(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo]) -> str:
+    """Return the array of points: by its name, else the only one that is no column, if it has rows of points."""
+    others = [name for name in members if not known_name(name)]
+    named = next((name for name in POINTS if name in members), "")
+    if named or len(others) != 1:
+        return named
+    shape, dtype = member_header(archive, members[others[0]])
+    if dtype.names:
+        return others[0] if {*"xyz"} <= {name.lower() for name in dtype.names} else ""
+    rows = len(shape) == 2 and dtype.kind in "fiu" and bool({*shape} & {*WIDTHS})
+    return others[0] if rows and max(shape) >= _ROWS_AT_LEAST else ""
 
 
 def _are_rings(columns: np.ndarray) -> bool:

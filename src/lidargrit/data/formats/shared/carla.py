@@ -62,4 +62,4 @@ def _has_intensity_of_carla(scan: Scan, points_m: Float64[np.ndarray, "n 3"]) ->
 
 def _azimuths_rise(points_m: Float64[np.ndarray, "n 3"]) -> bool:
     steps_rad = (np.diff(np.arctan2(points_m[:, 1], points_m[:, 0])) + np.pi) % (2 * np.pi) - np.pi
-    return float(np.sign(steps_rad).mean()) > _STEADY
+    return len(steps_rad) > 0 and float(np.sign(steps_rad).mean()) > _STEADY
