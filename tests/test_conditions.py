@@ -38,6 +38,17 @@ def test_what_was_observed_stands_bit_for_bit_and_the_rest_is_generated():
     assert torch.equal(Observed.nothing(SENSOR, 2).put_into(generated).range_m, generated.range_m)
 
 
+def test_scans_of_different_numbers_of_images_make_one_batch():
+    alone, two, three = (
+        replace(Observed.nothing(SENSOR, len(seeds)), earlier_seeds=torch.tensor(seeds) if len(seeds) > 1 else None)
+        for seeds in ([[]], [[-1], [7]], [[-1, -1], [-1, 4], [4, 5]])
+    )
+    batch = Observed.cat([alone, two, three, two[1:]])
+    assert batch.earlier_seeds is not None
+    assert batch.earlier_seeds.tolist() == [[-1, -1], [-1, -1], [-1, 7], [-1, -1], [-1, 4], [4, 5], [-1, 7]]
+    assert Observed.cat([alone, alone]).earlier_seeds is None
+
+
 def test_of_clean_surfaces_only_what_returned_is_kept():
     images = scans()
     known, generated = Observed.of_surfaces(images), RangeImage.masked(images.range_m + 1, images.return_mask, SENSOR)

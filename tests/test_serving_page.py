@@ -174,6 +174,11 @@ def test_an_example_is_one_click_away(example, panes, opened):
         assert filled[1] == 0
     else:
         assert 0 < filled[-1] < points[-1]
+    if example == "vlp16":  # with a task of scans of all rows
+        opened.click("#tasks [value=ahead]")
+        finish(opened)
+        assert "choose the task 'Add the rows that a VLP-16 lacks'" in said(opened)
+        assert "lidargrit " not in said(opened)
 
 
 def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opened):

@@ -160,7 +160,7 @@ class Observed(Condition):
             torch.cat([one.return_observed for one in parts]),
             sensor_of_all([one.sensor for one in parts]),
             common_planes([one.planes for one in parts], torch.cat),
-            _all_or_none([one.earlier_seeds for one in parts]),
+            _earlier_seeds(parts),
         )
 
     def __len__(self) -> int:
@@ -238,9 +238,19 @@ class Observed(Condition):
         return RangeImage.masked(range_m, returned, self.sensor, planes)
 
 
-def _all_or_none(parts: Sequence[Int64[Tensor, "b K"] | None]) -> Int64[Tensor, "B K"] | None:
-    known = [part for part in parts if part is not None]
-    return torch.cat(known) if len(known) == len(parts) else None
+def _earlier_seeds(parts: Sequence["Observed"]) -> Int64[Tensor, "B K"] | None:
+    """Return the seeds of all images, as many of each as the scan of most images has, those that lack filled by -1."""
+    known = [part.earlier_seeds for part in parts if part.earlier_seeds is not None]
+    if not known:
+        return None
+    most = max(seeds.shape[1] for seeds in known)
+    padded = []
+    for part in parts:
+        seeds = torch.full((len(part), most), -1, device=part.return_mask.device)
+        if part.earlier_seeds is not None and part.earlier_seeds.shape[1]:
+            seeds[:, -part.earlier_seeds.shape[1] :] = part.earlier_seeds
+        padded.append(seeds)
+    return torch.cat(padded)
 
 
 def _check_mask(observed: Bool[Tensor, "..."], range_m: Float[Tensor, "..."], what: str = "observed pixels") -> None:

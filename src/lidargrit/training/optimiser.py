@@ -57,17 +57,15 @@ def _as_matrices(weights: Sequence[nn.Parameter]) -> Iterator[None]:
     """Give each kernel and its gradient the shape of a matrix of one row for each output channel, as Muon takes it."""
     kernels = [(weight, weight.data, weight.grad) for weight in weights if weight.ndim > 2]
     for weight, values, gradient in kernels:
-        inner = not values.is_contiguous()  # channels lie innermost; their order among the columns is no matter
         weight.grad = None
-        weight.data = (values.movedim(1, -1) if inner else values).view(len(values), -1)
-        if gradient is not None:
-            weight.grad = (gradient.movedim(1, -1) if inner else gradient).flatten(1)
+        weight.data = values.flatten(1)  # a copy where channels lie innermost: checkpoints know one order
+        weight.grad = None if gradient is None else gradient.flatten(1)
     try:
         yield
     finally:
         for weight, values, gradient in kernels:
             weight.grad = None
-            weight.data = values
+            weight.data = values.copy_(weight.data.view(values.shape))
             weight.grad = gradient
 
 

@@ -181,7 +181,7 @@ def write_results_page(
             lattices = completed_lattices(generator.pixels.mask.phases)
     nearest = _nearest(new, real)
     sets = [
-        ScanSet("new", new, tuple(f"seed {seed}" for seed in range(len(new)))),
+        ScanSet("new", new, tuple(f"seed {seed}" for seed in range(len(new))), generated=True),
         ScanSet(f"nearest {kind} scan of training", real.batch(nearest), tuple(_name(real, one) for one in nearest)),
     ]
     results = errors, card, seconds, facts, folder

@@ -287,9 +287,9 @@ def _its_phases(demo: DemoPage) -> _Step:
 def _new_scans(demo: DemoPage) -> _Step:
     text = (
         f"On the left are scans that were just generated. Beside each stands the {demo.kind} scan, of those trained on "
-        "here, that is nearest to it pixel by pixel: the two share a street's shape, and are no copies. Ground, walls "
-        "and lost rays look right; cars, poles and people are blurred, and few can be named. Drag to turn the points, "
-        "use the wheel to zoom, and step through the scans with the arrows."
+        "here, that is nearest to it pixel by pixel: see for yourself whether it is a copy, and whether you can name "
+        "a car, a pole or a person on the left as on the right. Drag to turn the points, use the wheel to zoom, and "
+        "step through the scans with the arrows."
     )
     buttons = button("bin", ".bin") + button("ply", ".ply")
     return _Step("New scans", text, interactive.viewer_html("", f"Save {buttons}", f"Made by lidargrit {__version__}."))
@@ -303,7 +303,7 @@ def _scores(demo: DemoPage) -> _Step:
         "to do better. <i>Pixel statistics</i> (square) is the score of scans each of whose pixels comes from another "
         "held-out scan, so that no shape is left: any model should do better. Both are of half as many scans, and most "
         "metrics fall as sets grow, so a good score may lie below real against real. The bar behind the dot is the "
-        "95 % interval. They cannot be compared with published tables."
+        "95 % interval. The scores cannot be compared with published tables."
     )
     return _Step("Scores of the new scans", text, score_table(demo.card))
 

@@ -174,6 +174,7 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
         scans.append(scan)
     return {
         "name": scan_set.name,
+        "generated": scan_set.generated,
         "height": images.sensor.height,
         "width": images.sensor.width,
         "elevation": _packed(images.sensor.elevation_rad.numpy().astype("<f4")),

@@ -38,6 +38,7 @@ class ScanSet:
         filled: True for pixels whose point a model filled in; None where no scan says so.
         beside: points of each scan that have no pixel in its image, None for none; empty if the scans are no clouds.
         shows_beside: whether a page shows these points, too, or only counts them.
+        generated: whether a model generated all of it.
     """
 
     name: str
@@ -47,6 +48,7 @@ class ScanSet:
     filled: Bool[Tensor, "B H W"] | None = None
     beside: tuple[Scan | None, ...] = ()
     shows_beside: bool = False
+    generated: bool = False
 
     def hidden(self) -> list[int]:
         """Return how many points of each scan are not shown."""
@@ -127,7 +129,7 @@ def _of_generator(name: str, generator: Generator, seeds: range, scans: ScanSet 
         else:
             reporting.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
     generated = _joined(generator.sample(seeds[part]) for part in _parts(len(seeds)))
-    yield ScanSet(f"{_short(name)}: generated", generated, tuple(f"seed {one}" for one in seeds))
+    yield ScanSet(f"{_short(name)}: generated", generated, tuple(f"seed {one}" for one in seeds), generated=True)
 
 
 def _fine(sensor: SensorModel) -> SensorModel:

@@ -246,15 +246,22 @@ class MaskNetwork(PhaseNetwork):
             earlier_seeds: seeds of images whose columns lie before those of each image, the nearest last, and -1 for
                 none; their numbers then correlate with its own.
         """
-        numbers = [self._uniform_of(rng) for rng in rngs]
-        for at, seeds in enumerate([] if earlier_seeds is None else earlier_seeds.tolist()):
-            before = [self._uniform_of(rng) for rng in rngs_of([seed for seed in seeds if seed >= 0])]
-            numbers[at] = following(numbers[at], before)
-        return torch.stack(numbers).to(self.row_bias.device)
+        shares = self.noise.shares()
 
-    def _uniform_of(self, rng: torch.Generator) -> Float[Tensor, "H W"]:
-        uniform = torch.rand((self.sensor.height, self.sensor.width), generator=rng)
-        return self.noise(uniform, rng, self.noise.shares())
+        def of(rng: torch.Generator) -> Float[Tensor, "H W"]:
+            return self.noise(torch.rand((self.sensor.height, self.sensor.width), generator=rng), rng, shares)
+
+        numbers = [of(rng) for rng in rngs]
+        every = (
+            [] if earlier_seeds is None else [[one for one in seeds if one >= 0] for seeds in earlier_seeds.tolist()]
+        )
+        seeds = sorted({one for some in every for one in some})
+        drawn = {
+            seed: of(rng) for seed, rng in zip(seeds, rngs_of(seeds), strict=True)
+        }  # images of one scan share them
+        for at, some in enumerate(every):
+            numbers[at] = following(numbers[at], [drawn[seed] for seed in some])
+        return torch.stack(numbers).to(self.row_bias.device)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.

@@ -10,7 +10,7 @@ class Source {
     this.rangeStepM = data.rangeStepM;
     this.endM = data.endM;
     this.classes = data.classes;
-    this.generated = data.name === "generated"; // by a model, every point
+    this.generated = data.generated; // by a model, every point
     this.columns = data.columnStride > 1 ? `, one in ${data.columnStride} columns` : "";
     this.data = data;
     this.unpacked = new Map();

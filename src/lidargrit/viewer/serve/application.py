@@ -176,6 +176,8 @@ class Application:
             query = environment.get("QUERY_STRING", "")[:at_most]
             text = urllib.parse.unquote_to_bytes(query.removeprefix("request="))
         request = parse_request(parse_json_object(text), self._settings, self._queue.limits)
+        if path == "/generate" and request.example:
+            raise ConfigError(f"example={request.example!r} to generate", "no example", "ask /complete for its task")
         if path == "/complete":
             self._check_task(request)
             if not request.example:

@@ -137,7 +137,8 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
     seeds = range(request.seed, request.seed + request.count)
     if not request.has_scan:
         names = tuple(f"seed {seed}" for seed in seeds)
-        return [ScanSet("generated", generator.sample(seeds, sampling=sampling).to("cpu"), names)]
+        new = generator.sample(seeds, sampling=sampling).to("cpu")
+        return [ScanSet("generated", new, names, generated=True)]
     seen = _read_scan(request, generator, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
     measured = torch.zeros_like(image.return_mask)  # nothing in it was filled
@@ -170,13 +171,18 @@ def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVar
 
 def _read_scan(request: SampleRequest, generator: Generator, reader: ScanReader) -> InputScan:
     """Simulate an example, or read an uploaded file, and project it; messages name no path on the server."""
-    if request.example:
-        return reader.read(_example(EXAMPLES[request.example], generator.sensor))
     path = Path(request.file)
     try:
-        scan = dataclasses.replace(formats.read_scan(path, bad_points="drop"), source=request.name)
+        if request.example:
+            scan = _example(EXAMPLES[request.example], generator.sensor)
+        else:
+            scan = formats.read_scan(path, bad_points="drop")
+        scan = dataclasses.replace(scan, source=request.name)
     except LidarGritError as error:
-        parts = [part.replace(str(path), request.name) for part in (error.got, error.wanted, error.cure)]
+        parts = [
+            part.replace(str(path), request.name).replace(path.name, request.name)
+            for part in (error.got, error.wanted, error.cure)
+        ]
         raise type(error)(*parts) from None
     try:
         return reader.read(scan)

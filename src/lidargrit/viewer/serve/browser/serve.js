@@ -86,8 +86,10 @@ class Desk {
     el("count").max = String(limits.scans);
     el("model").addEventListener("change", () => this.offer());
     el("request").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
-    el("own").addEventListener("submit", (event) => this.workOn(event.submitter.value));
-    el("own").addEventListener("submit", (event) => event.preventDefault());
+    el("own").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.workOn(event.submitter?.value ?? "ahead");
+    });
     el("file").addEventListener("change", () => this.chooseExample(""));
     for (const button of el("examples").children) {
       button.addEventListener("click", () => {
@@ -103,10 +105,14 @@ class Desk {
 
   // The page begins with a scan that turns, until somebody takes hold of it.
   async begin() {
-    el("count").value = "1";
-    await this.submit(null, () => this.generate());
-    el("count").value = "3";
-    this.page?.turn();
+    let touched = false;
+    for (const kind of ["pointerdown", "keydown", "wheel"]) {
+      window.addEventListener(kind, () => (touched = true), { once: true, capture: true });
+    }
+    await this.submit(null, () => this.generate(1));
+    if (!touched) {
+      this.page?.turn();
+    }
   }
 
   chooseExample(name) {
@@ -181,8 +187,8 @@ class Desk {
     return { model: Number(el("model").value), seed: Number(el("seed").value), sampling: Object.fromEntries(data) };
   }
 
-  generate() {
-    const request = { ...this.request(), count: Number(el("count").value) };
+  generate(count = Number(el("count").value)) {
+    const request = { ...this.request(), count };
     return asked("/generate", { method: "POST", body: JSON.stringify(request) });
   }
 
@@ -286,6 +292,7 @@ class Desk {
     this.page.arrange(panes);
     if (panes.length === 0) {
       [el("empty").hidden, el("viewer").hidden] = [false, true];
+      el("empty").textContent = "Generate a scan, or choose one to work on.";
       return;
     }
     for (const mode of Object.keys(panes[0].scales)) {
