@@ -141,7 +141,7 @@ def test_nuscenes_keeps_its_own_file_with_the_rows_that_are_no_points(tmp_path):
     [
         ("empty", "an empty file"),
         ("nan", "with NaN or infinite coordinates"),
-        ("rolled", "outside the sensor's elevations"),
+        ("rolled", "in the axes of a camera"),
         ("other", "16 rings in"),
     ],
 )

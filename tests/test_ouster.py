@@ -172,7 +172,9 @@ def test_ouster_recordings_that_are_refused_in_one_line(capture):
         read_scan(capture)
     (capture.with_name("b.json")).unlink()
     dataset = open_dataset(str(capture.parent))
-    with pytest.raises(ScanError, match=r"a\.pcap without a\.json; .*; record it again") as refusal:
+    with pytest.raises(
+        ScanError, match=r"a\.pcap without a\.json; .*; if an Ouster sent it, record it again"
+    ) as refusal:
         dataset.scan(0)
     one_line(refusal)
 

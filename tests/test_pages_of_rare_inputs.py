@@ -32,12 +32,12 @@ def test_a_file_that_changed_after_it_was_chosen_is_told_apart_from_a_dead_serve
     load("ply").write(path, lidargrit.simulate(seed=5))
     with running(tmp_path / "runs") as served:
         browser.send("Page.navigate", url=served.url)
-        browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk !== null")
+        browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk?.busy === false")
         root = browser.send("DOM.getDocument")["root"]["nodeId"]
         node = browser.send("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
         browser.send("DOM.setFileInputFiles", files=[str(path)], nodeId=node)
         path.write_bytes(path.read_bytes() + b" ")
-        browser.click("#complete")
+        browser.click("#tasks [value=ahead]")
         browser.wait("!document.querySelector('#error').hidden")
         told = browser.run("document.querySelector('#error').textContent")
     assert told == "mine.ply has changed since you chose it, or can no longer be read. Choose it again."

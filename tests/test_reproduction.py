@@ -128,8 +128,8 @@ def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
 
 def test_settings_that_a_stage_cannot_follow_are_told_before_any_scan(monkeypatch):
     monkeypatch.delattr("lidargrit.evaluation.reproduction.load_range_images")
-    wrong = Reproduction(3, "simulated", small=True, flops=0.0, settings=("training.tokenizer.optimiser=muon",))
-    with pytest.raises(ConfigError, match="optimiser=muon for networks without linear layers"):
+    wrong = Reproduction(3, "simulated", small=True, flops=0.0, settings=("training.tokenizer.accumulate=3",))
+    with pytest.raises(ConfigError, match="on 1 processes in 3 parts"):
         prepare(wrong.benchmark(), [*wrong.systems().values()])
 
 

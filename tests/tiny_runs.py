@@ -41,7 +41,8 @@ LONG = [  # 12 and 6 steps on 64x32 images, a checkpoint after each
 ]
 PROGRESS = re.compile(
     r"(projecting scans|training \w+|sampling): \d+/\d+|  after \d+ scans|\s*WARNING: |left out: |lidargrit demo: "
-    r"about |the model in the package is of another sensor|The tokenizer, .* learn anew here|"
+    r"about |timing some steps of training|the model in the package is of another sensor|"
+    r"The tokenizer, .* learn anew here|"
     r".*: no sensor is named, so "
 )
 

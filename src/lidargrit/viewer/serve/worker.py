@@ -183,6 +183,8 @@ def _read_scan(request: SampleRequest, generator: Generator, reader: ScanReader)
             part.replace(str(path), request.name).replace(path.name, request.name)
             for part in (error.got, error.wanted, error.cure)
         ]
+        if ":/" in error.cure:  # of HDF5: the page offers no choice of a dataset
+            parts[2] = "keep one dataset of points in the file"
         raise type(error)(*parts) from None
     try:
         return reader.read(scan)
