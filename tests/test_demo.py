@@ -1,38 +1,10 @@
 """The demo: which networks it trains, on whose scans, and what it says of that."""
 
-import json
-from functools import partial
-
-from lidargrit.cli import main
 from lidargrit.core import reporting
 from lidargrit.data.datasets import load
-from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.generation.settings import Preset
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.viewer import demo
-
-
-def test_demo_trains_the_packaged_model_further_on_a_users_own_drives(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
-    load("kitti_odometry").write_example(tmp_path / "own scans", 4)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 2)
-    monkeypatch.setattr("lidargrit.viewer.demo._plot_pictures", lambda *_: None)  # of more samples, in test_cli.py
-    monkeypatch.setattr("lidargrit.viewer.demo.EvalConfig", partial(EvalConfig, metrics=("bev_jsd",)))
-    few = ["training.tokenizer.scans=2", "training.transformer.scans=8", "training.pixels.scans=2"]
-    assert main(["demo", "--data", str(tmp_path / "own scans"), "--set", *few]) == 0
-    run = tmp_path / "runs" / "demo-own scans"
-    preset = json.loads((run / "run.json").read_text())["preset"]
-    assert preset["data"]["train"] == [f"kitti_odometry:{tmp_path / 'own scans'}:00"]
-    assert preset["data"]["val"] == [f"kitti_odometry:{tmp_path / 'own scans'}:08"]
-    assert preset["data"]["sensor"] == "hdl64e_kitti_odometry"
-    assert preset["stages_from"] == "pretrained"
-    assert {"train the tokenizer", "train the transformer", "train the pixels"} < set(
-        json.loads((run / "timings.json").read_text())
-    )
-    assert "the pixel decoder learn further here, from the weights of the model in the package" in (
-        run / "demo.html"
-    ).read_text(encoding="utf-8")
 
 
 def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):

@@ -1,10 +1,6 @@
 """The paper's tables from scans to rows: which rows, killed and taken up again, told beforehand."""
 
-import os
-import signal
-import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,7 +13,6 @@ from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction, prepare
 from lidargrit.evaluation.tables import published
 from lidargrit.generation.presets import load_preset
-from lidargrit.training import train
 from tiny_runs import MODEL, SIMULATED, the_one_line
 
 STEPS = [  # 4 and 2 of them, a checkpoint after each
@@ -31,48 +26,6 @@ def words_for(folder: Path, *more: str) -> list[str]:
     few = ["-n", "4", "--flops", "0"]
     table = ["compare", str(folder), "--paper-table", "3", "--data", "simulated", "--small"]
     return [*table, *few, *more, "--set", *MODEL, *SIMULATED, *STEPS]
-
-
-def test_a_killed_reproduction_goes_on_and_ends_with_the_table(tmp_path, capsys):
-    folder = tmp_path / "ablation"
-    second = folder / "runs" / "lidargrit_small_raydrop" / "tokenizer" / "checkpoint.safetensors"
-    command = [sys.executable, "-m", "lidargrit", *words_for(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=dict(os.environ))
-    until = time.monotonic() + 200
-    while not second.exists() and process.poll() is None and time.monotonic() < until:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    assert process.wait() == -signal.SIGKILL
-    assert second.exists()
-    assert not (folder / "runs" / "lidargrit_small_both").exists()
-    first = folder / "lidargrit_small_neither" / "lidargrit_small_neither.json"
-    scored = first.stat().st_mtime_ns
-
-    assert main(words_for(folder)) == 0
-    captured = capsys.readouterr()
-    assert first.stat().st_mtime_ns == scored
-    assert "scores are there already" in captured.err
-    for row in ("lidargrit_small_neither", "lidargrit_small_raydrop", "lidargrit_small_both"):
-        assert f"\n{row} " in captured.out
-    for metric in ("sliced_wasserstein", "minimum_matching_distance", "point_cloud_jsd"):
-        assert f"{metric} (reference)" in captured.out
-    assert "Published scores of lidargrit_kitti_odometry\nleft out, for they do not compare: 4 of the" in captured.out
-    assert "61.73" not in captured.out
-    assert "the paper's row 'with both' is measured by lidargrit_small_both" in captured.out
-
-    # The killed run went on as if it had not been.
-    preset = load_preset("lidargrit_small_raydrop", reproduction_of(folder).benchmark().preset_settings)
-    train(preset, tmp_path / "whole")
-    weights = [
-        (run / "model.safetensors").read_bytes() for run in (tmp_path / "whole", folder / "runs" / second.parts[-3])
-    ]
-    assert weights[0] == weights[1]
-
-    before = {path: path.stat().st_mtime_ns for path in folder.glob("*/**/*") if path.is_file()}
-    table = (folder / "table.json").read_bytes()
-    assert main(words_for(folder)) == 0
-    assert {path: path.stat().st_mtime_ns for path in folder.glob("*/**/*") if path.is_file()} == before
-    assert (folder / "table.json").read_bytes() == table
 
 
 def reproduction_of(folder: Path) -> Reproduction:

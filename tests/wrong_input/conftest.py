@@ -42,8 +42,9 @@ def rows(tmp_path_factory) -> np.ndarray:
 
 
 @pytest.fixture
-def refused(capsys, tmp_path):
+def refused(capsys, tmp_path, monkeypatch):
     """Return a function that runs a command, which must be refused and change nothing, and returns the one line."""
+    monkeypatch.setattr("lidargrit.viewer.demo.measure", lambda _preset: [])  # seconds, for an estimate
 
     def run(*words: object) -> str:
         capsys.readouterr()
