@@ -32,8 +32,7 @@ def has_points(archive: zipfile.ZipFile) -> bool:
         ValueError: that one array is damaged.
     """
     members = _members(archive)
-    axes = {*"xyz"} <= {name.lower() for name in members}
-    return axes or (_IMAGE not in members and bool(_points_name(archive, members)))
+    return _has_axes(members) or (_IMAGE not in members and bool(_points_name(archive, members)))
 
 
 def columns_of_archive(archive: zipfile.ZipFile, path: Path, wanted: str) -> tuple[dict[str, np.ndarray], list[str]]:
@@ -44,7 +43,7 @@ def columns_of_archive(archive: zipfile.ZipFile, path: Path, wanted: str) -> tup
     """
     members = _members(archive)
     there, points_name, columns = [*members], _points_name(archive, members), dict[str, np.ndarray]()
-    if not has_points(archive):
+    if not _has_axes(members) and (_IMAGE in members or not points_name):
         if _IMAGE in members:
             got, cure = "a range image from a folder of samples", f"name the whole folder: {path.absolute().parent}"
         else:
@@ -103,6 +102,10 @@ def columns_of_rows(rows: np.ndarray, path: Path, wanted: str) -> dict[str, np.n
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     return {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+
+
+def _has_axes(members: Mapping[str, zipfile.ZipInfo]) -> bool:
+    return {*"xyz"} <= {name.lower() for name in members}
 
 
 def _points_name(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo]) -> str:
