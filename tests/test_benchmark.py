@@ -188,7 +188,10 @@ def test_images_that_only_count_mark_surfaces_that_return():
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():
-    preset = load_preset("lidargrit_compact_pixels", ["stages_from=pretrained", "train_anew=[pixels]"])
+    preset = load_preset(
+        "lidargrit_compact_pixels",
+        [f"training.{stage}.start=frozen:pretrained" for stage in ("tokenizer", "transformer")],
+    )
     flops = training_flops(preset)
     assert list(flops) == ["pixels"]
     scaled = with_budget(preset, flops["pixels"] / 4)
