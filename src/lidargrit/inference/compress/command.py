@@ -109,9 +109,10 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     facts |= {"step_mm": codec.steps.step_mm, "format": kind}
     folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], names)
     with folder.writing("decompressing") as progress:
-        write_json(out / SENSOR_FILE, codec.sensor.to_json())
         for number in folder.missing:
             image, file = codec.decompress(archive.read(indices[number])), out / folder.files[number]
+            if not (out / SENSOR_FILE).exists():
+                write_json(out / SENSOR_FILE, codec.sensor.to_json())
             if form is None:
                 write_array(file, image.range_m)
             else:
