@@ -56,12 +56,12 @@ def test_a_metric_that_would_not_have_seen_damaged_objects_is_not_within_noise()
         "Against real scans: worse in 0 of 2 scores, within noise in 1 (bev_jsd), undecided in 1 (coverage)."
     )
     assert note == (
-        "coverage would not have seen blurred ranges, missing vehicles or boxes in their place, at least one of them, "
-        "with 200 scans: no good score there is called within noise."
+        "With 200 scans, coverage cannot see at least one of these: blurred ranges, missing vehicles, boxes in place of "
+        "vehicles. So a good score there is not called within noise."
     )
     convicted = said(score(0.85, 0.1, 0.9, metric="coverage"))
     assert convicted[1].startswith("Against real scans: worse in 1 of 1 scores")
-    assert not any("would not have seen" in sentence for sentence in convicted)
+    assert not any("cannot see" in sentence for sentence in convicted)
 
 
 def test_a_damage_that_was_seen_with_fewer_scans_is_seen_with_more(monkeypatch):

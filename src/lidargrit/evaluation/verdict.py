@@ -124,8 +124,8 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
         notes.append(f"Pixel statistics pass for real scans in {', '.join(blind)}: no good score there is counted.")
     if dull := [names[each] for each, stands in by_real.items() if stands in (0, -1) and each in seeing - sharp]:
         notes.append(
-            f"{', '.join(dull)} would not have seen blurred ranges, missing vehicles or boxes in their place, at least "
-            f"one of them, with {counted_scans(scans)}: no good score there is called within noise."
+            f"With {counted_scans(scans)}, {', '.join(dull)} cannot see at least one of these: blurred ranges, missing "
+            "vehicles, boxes in place of vehicles. So a good score there is not called within noise."
         )
     if left_out:
         notes.append(f"Not scored, so undecided: {', '.join(map(names.__getitem__, left_out))}.")
