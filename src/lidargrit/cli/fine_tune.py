@@ -41,5 +41,6 @@ def run(options: argparse.Namespace) -> None:
         print(plan.as_text())
         return
     train(preset, options.out)
+    val = preset.data.val[0]
     print(f"done: lidargrit sample {options.out} samples -n 16, or --model {options.out} wherever a run is wanted")
-    print(f"bits before and after: lidargrit likelihood {preset.data.val[0]} --model pretrained, then {options.out}")
+    print(f"bits and errors on scans that it did not learn from: lidargrit likelihood {val} --model {options.out}")
