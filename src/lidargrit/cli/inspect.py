@@ -14,7 +14,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.add_argument("scans", help="file of a scan, or a source of scans whose first scan is inspected")
     add_scans(parser)
     parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
@@ -22,7 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Project one scan and print what became of it."""
     from lidargrit.core import reporting
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.data.sources.first_scan import first_scan

@@ -8,6 +8,7 @@ from typing import Any
 from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, nearest_names, one_of
 from lidargrit.core.files import refuse_to_overwrite
+from lidargrit.core.table import render
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, SampleSource, Source, TensorSource, open_source
@@ -16,8 +17,8 @@ from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair
 from lidargrit.evaluation.protocols import public_name
-from lidargrit.evaluation.raydrop import raydrop_json, raydrop_model, raydrop_table, scores_of_model
-from lidargrit.evaluation.realism import CurveScore, as_json, as_table, compare, scans_of_both
+from lidargrit.evaluation.raydrop import raydrop_model, scores_of_model
+from lidargrit.evaluation.realism import CurveScore, compare, scans_of_both, tables
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.nn.devices import usable_device
 
@@ -31,14 +32,6 @@ def evaluate(
     overwrite: bool = False,
 ) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
     """Score samples against a reference.
-
-    Args:
-        samples: name of the first set: samples, or any source of scans.
-        reference: name of the second set.
-        config: metrics, protocol and projection of the comparison.
-        report: file for a report.
-        write_report: function that writes the report.
-        overwrite: whether a report that is there already is replaced.
 
     Returns:
         a table, its plain values, and a function that writes the report, None where none is wanted.
@@ -80,9 +73,6 @@ def evaluate_streets(
     """Compare simulated streets, and independent drops of their clean scans, with real scans.
 
     Args:
-        samples: name of the streets.
-        streets: streets of this name, by :func:`streets_of`.
-        reference: source of real scans.
         model: run that drops returns of clean scans, which is compared too; none if empty.
 
     Returns:
@@ -94,9 +84,9 @@ def evaluate_streets(
     )
     of_model = scores_of_model(drops, simulated, real) if drops else []
     scores = compare(simulated, real)
-    text = "\n\n".join([as_table(scores), *([raydrop_table(of_model)] if drops else [])])
     about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
-    return text, {**about, "curves": as_json(scores), "raydrop": raydrop_json(of_model)}, scores
+    found = {"curves": [each.to_json() for each in scores], "raydrop": [each.to_json() for each in of_model]}
+    return render(tables([*scores, *of_model])), {**about, **found}, scores
 
 
 def read_config(
@@ -111,11 +101,7 @@ def read_config(
     """Turn words and numbers, as a user types them, into a configuration.
 
     Args:
-        metrics: names of metrics, in place of the protocol's.
         weights: words such as ``pointnet=FILE``.
-        groups: number of groups that each set is cut into.
-        intervals: number of half-samples; 0 for no intervals.
-        settings: further settings of :class:`EvalConfig`, by name.
     """
     scans = scans or ScanSettings()
     settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans

@@ -162,10 +162,6 @@ def compare_pair(
 ) -> Scorecard:
     """Score two opened sets.
 
-    Args:
-        pair: the two sets.
-        settings: protocol and its changes.
-
     Raises:
         LidarGritError: not one metric could be computed; the reason of the first.
     """

@@ -3,9 +3,8 @@
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,8 +13,9 @@ from torch import Tensor
 from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, DataError, UsageError, counted_scans
+from lidargrit.core.table import Table
 from lidargrit.data.images import RangeImages
-from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices
 from lidargrit.inference.complete import Model
@@ -28,7 +28,8 @@ PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
 """Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""
 BASELINE = "triangulation"
 VOXEL_M = 0.1
-_REFLECTANCE_WIDTH = 25  # of the column, in letters
+_HEAD = ("model", "MAE [m]", "MAE - triangulation [m]", "found", "IoU", "drop runs", "diversity [m]", "s/scan")
+_HEAD += ("reflectance MAE", "class accuracy", "mIoU")
 
 
 @dataclass(frozen=True)
@@ -115,40 +116,30 @@ def compare_completion(
     return scores
 
 
-def as_table(scores: Sequence[CompletionScore]) -> str:
-    """Return scores as lines for a terminal."""
-    lines = []
-    width = max(len(score.model) for score in scores) + 2
+def tables(scores: Sequence[CompletionScore]) -> list[Table]:
+    """Return a table for each pattern."""
+    found = []
     for pattern in dict.fromkeys(score.observed for score in scores):
-        lines.append(f"observed: {pattern}")
-        head = f"{'MAE [m]':>24}{'MAE - triangulation [m]':>25}{'found':>8}{'IoU':>8}{'drop runs':>11}"
-        labelled = any(score.class_accuracy is not None for score in scores)
-        of_classes = f"{'class accuracy':>16}{'mIoU':>7}" if labelled else ""
-        bright = any(score.reflectance_error is not None for score in scores)
-        of_reflectance = f"{'reflectance MAE':>{_REFLECTANCE_WIDTH}}" if bright else ""
-        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s/scan':>10}{of_reflectance}{of_classes}")
-        for score in scores:
-            if score.observed != pattern:
-                continue
-            beside = "" if score.beside_triangulation_m is None else score.beside_triangulation_m.as_text("+.3f")
-            diversity = "" if score.diversity_m is None else f"{score.diversity_m.value:.3f}"
-            error = "" if score.reflectance_error is None else score.reflectance_error.as_text(".4f")
-            of_reflectance = f"{error:>{_REFLECTANCE_WIDTH}}" if bright else ""
-            of_classes = ""
-            if score.class_accuracy is not None and score.class_iou is not None:
-                of_classes = f"{score.class_accuracy.value:>16.3f}{score.class_iou:>7.3f}"
-            lines.append(
-                f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>25}{score.found.value:>8.3f}"
-                f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
-                + of_reflectance
-                + of_classes
-            )
-    return "\n".join(lines)
+        rows = tuple(_row(score) for score in scores if score.observed == pattern)
+        found.append(Table(_HEAD, rows, f"observed: {pattern}").filled())
+    return found
 
 
-def as_json(scores: Sequence[CompletionScore]) -> list[dict[str, Any]]:
-    """Return scores for a file."""
-    return [asdict(score) for score in scores]
+def _row(score: CompletionScore) -> tuple[str, ...]:
+    beside, diversity, error = score.beside_triangulation_m, score.diversity_m, score.reflectance_error
+    return (
+        score.model,
+        score.mae_m.as_text(".3f"),
+        "" if beside is None else beside.as_text("+.3f"),
+        f"{score.found.value:.3f}",
+        f"{score.iou.value:.3f}",
+        f"{score.drop_run_lengths:.4f}",
+        "" if diversity is None else f"{diversity.value:.3f}",
+        f"{score.seconds_per_scan:.3f}",
+        "" if error is None else error.as_text(".4f"),
+        "" if score.class_accuracy is None else f"{score.class_accuracy.value:.3f}",
+        "" if score.class_iou is None else f"{score.class_iou:.3f}",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +218,7 @@ def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
             found.append(each.score)
             continue
         difference = Estimate.of([own - its for own, its in zip(each.errors_m, base, strict=True)])
-        found.append(CompletionScore(**{**vars(each.score), "beside_triangulation_m": difference}))
+        found.append(replace(each.score, beside_triangulation_m=difference))
     return found
 
 

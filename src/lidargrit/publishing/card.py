@@ -35,8 +35,6 @@ def model_card(
     Args:
         about: content of its ``run.json``; empty if there is no such file.
         learned: recordings and images that it was trained on.
-        scores: scores of its samples, if there are any.
-        bits: bits of a stored parameter, 8, 16 or 32.
 
     Source:
         The head's entries are those of the hub's documentation, "Model cards".

@@ -9,7 +9,6 @@ def document(title: str, style: str, content: str, script: str = "", scans: str 
     """Return a whole page, which fetches nothing and runs no other script, whatever a name in it may hold.
 
     Args:
-        title: title of the page, as text.
         style: style sheets.
         content: HTML of the page.
         script: the one script that may run; none if empty.
@@ -38,8 +37,6 @@ def figure(picture: str, caption: str, spoken: str = "") -> str:
     """Return a picture with its caption.
 
     Args:
-        picture: data URI of the picture.
-        caption: text below it.
         spoken: words for those who do not see the picture; the caption if empty.
     """
     alt = escape(spoken or caption)

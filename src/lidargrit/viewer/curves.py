@@ -31,9 +31,6 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
     Curves with two axes, such as a histogram for every row, get one image for each of the three, and the mean over
     rows where rows are of one kind.
-
-    Args:
-        title: title of the whole picture.
     """
     if not scores:
         raise ConfigError("no curve", "at least one", "compare some scans first")
@@ -56,18 +53,18 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
 
 def _curve(score: CurveScore, which: str) -> Float64[np.ndarray, "*rows n"]:
-    result = score.bernoulli if which == "Bernoulli" else score.simulated
+    result = score.bernoulli if which == "Bernoulli" else score.own
     return np.array(result.details["real" if which == "real" else "generated"], dtype=float)
 
 
 def _title(score: CurveScore) -> str:
-    name = score.simulated.metric.replace("_", " ")
-    distances = f"simulated {score.simulated.value:.3f}, Bernoulli {score.bernoulli.value:.3f}"
+    name = score.own.metric.replace("_", " ")
+    distances = f"simulated {score.own.value:.3f}, Bernoulli {score.bernoulli.value:.3f}"
     return f"{name}\ndistance of real from {distances}, real {score.real_against_real.value:.3f}"
 
 
 def _plot_lines(axes: Axes, score: CurveScore) -> None:
-    details = score.simulated.details
+    details = score.own.details
     axis, label = np.array(details["axis"], dtype=float), details["axis_label"]
     lags = axis[0] < 0  # rows and columns share the axis: no line of numbers
     for which, colour in _SIDES.items():
@@ -94,10 +91,10 @@ def _log_axis(axes: Axes) -> None:
 
 def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
     """Plot the three images on one scale, with the mean over rows beside them where rows share an axis."""
-    details = score.simulated.details
+    details = score.own.details
     axis = np.array(details["axis"], dtype=float)
     images = {which: _curve(score, which) for which in _SIDES}
-    is_map = score.simulated.metric in _MAPS
+    is_map = score.own.metric in _MAPS
     grid = cell.subgridspec(1, 4, wspace=0.25)
     norm = PowerNorm(0.5, 0, np.nanmax([np.nanmax(image, initial=0) for image in images.values()]) or 1)
     for index, (which, image) in enumerate(images.items()):

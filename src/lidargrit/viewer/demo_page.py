@@ -21,11 +21,10 @@ from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 from lidargrit.viewer import interactive
 from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.interactive import button
-from lidargrit.viewer.report_charts import bar_chart
+from lidargrit.viewer.report_charts import bar_chart, score_table
 from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate_picture
 from lidargrit.viewer.report_style import STYLE
 from lidargrit.viewer.scan_sets import ScanSet
-from lidargrit.viewer.score_table import score_table
 
 _LATTICES_SHOWN = 4  # the finest: of coarser ones a picture has a handful of pixels
 _EVERY_PIXEL = Lattice(1, 1)

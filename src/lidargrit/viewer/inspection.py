@@ -29,11 +29,7 @@ _DOTS_AT_MOST = 20_000  # of one kind in a view; more hide one another and take 
 
 
 def plot_inspection(inspection: Inspection, path: Path) -> None:
-    """Plot which points collide, which are lost, and their elevations beside the sensor's rows.
-
-    Args:
-        inspection: result of inspecting one scan.
-    """
+    """Plot which points collide, which are lost, and their elevations beside the sensor's rows."""
     figure = Figure(figsize=(14, 11), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplot_mosaic(

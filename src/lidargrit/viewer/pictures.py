@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
@@ -14,7 +15,11 @@ from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.generator import Generator
+from lidargrit.scans.condition import Nothing
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
@@ -26,6 +31,7 @@ _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one 
 _TICKS_AT_LEAST, _TICKS_AT_MOST = 3, 6  # of elevation: enough to read a row's by, and words that do not overlap
 _FILLED, _FILLED_NOTE = "#e8730c", "\norange = filled in by a model"
 _SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
+_SCANS = 2  # a glance; more would take training's time
 
 
 def plot_comparison(
@@ -45,7 +51,6 @@ def plot_comparison(
     Args:
         groups: range images by name ("real", "reconstructed", ...), each one or a batch of 1 to 8; sensors may differ.
         max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
-        title: title of the whole picture.
         labels: names of the scans; "scan 1", ... if not given.
         surprise: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
             :meth:`lidargrit.scans.types.ScanBits.surprise`.
@@ -227,3 +232,16 @@ def _plot_scales(figure: Figure, height: float, scales: _Scales, more: str = "")
         ScalarMappable(scales.height_norm, scales.height_colours), bar, orientation="horizontal"
     )
     colour_bar.set_label("from above: height over the sensor [m]", fontsize=10, labelpad=1)
+
+
+@torch.no_grad()
+def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
+    """Plot validation scans, their reconstructions, and new scans once more than a tokenizer is in training."""
+    real = val.batch(evenly_spaced(_SCANS, len(val)))
+    groups = {"val": real}
+    if "encode" in generator.capabilities:
+        groups["reconstructed"] = generator.reconstruct(real).to("cpu")
+    samples = stage != generator.stages[0] or len(generator.stages) == 1
+    if samples and Nothing in generator.takes:
+        groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
+    plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

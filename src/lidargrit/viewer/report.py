@@ -25,7 +25,7 @@ from lidargrit.evaluation.profiles import (
 )
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, LeftOut, Scorecard
 from lidargrit.viewer._page import document, figure
-from lidargrit.viewer.report_charts import line_chart
+from lidargrit.viewer.report_charts import REAL_AGAINST_REAL, line_chart, score_table
 from lidargrit.viewer.report_pictures import (
     NO_RETURN,
     density_picture,
@@ -34,7 +34,6 @@ from lidargrit.viewer.report_pictures import (
     rate_picture,
 )
 from lidargrit.viewer.report_style import STYLE
-from lidargrit.viewer.score_table import REAL_AGAINST_REAL, score_table
 
 _MATCHES = 3  # best, and as many worst
 _SHEET = 12  # samples on the sheet
@@ -42,12 +41,7 @@ _NAME = 48  # longest name, in letters: what fits below half of the page
 
 
 def write_report(card: Scorecard, pair: EvalPair, path: Path) -> None:
-    """Write a page with scores, pictures and settings; it needs no network, no script and no other file.
-
-    Args:
-        card: scores and facts of the evaluation.
-        pair: the two sets of scans that were compared.
-    """
+    """Write a page with scores, pictures and settings; it needs no network, no script and no other file."""
     write_text(path, page(card, pair))
 
 

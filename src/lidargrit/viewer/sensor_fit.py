@@ -15,11 +15,7 @@ _BINS_PER_ROW = 12  # of the histogram of elevations: enough to see a gap betwee
 
 
 def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
-    """Plot elevations with the fitted rows, the spread and number of points of each ring, and steps in azimuth.
-
-    Args:
-        fit: fitted sensor with its residuals.
-    """
+    """Plot elevations with the fitted rows, the spread and number of points of each ring, and steps in azimuth."""
     figure = Figure(figsize=(14.0, 9.0), dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     sensor = fit.sensor

@@ -31,11 +31,7 @@ def view(
     """Plot scans, samples, and the scans that runs generate and reconstruct.
 
     Args:
-        sources: sources, as :func:`load_scan_sets` takes them.
         out: path of the PNG, or of the page if it ends in ``.html``.
-        count: number of scans of each set, evenly spaced over its source.
-        seed: seed of the first generated scan.
-        settings: sensor that scans are imaged with, and settings of reading them.
         surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
             the return mask; none if empty.
     """

@@ -6,13 +6,14 @@ from html import escape
 from typing import Any
 
 from lidargrit.core.errors import without_folders
+from lidargrit.core.table import Table
 from lidargrit.evaluation.intervals import Score
 from lidargrit.evaluation.scorecard import Scorecard, format_value
-from lidargrit.evaluation.tables import NamedCard, TableBlock, comparable, judge
+from lidargrit.evaluation.tables import NamedCard, comparable, judge
 from lidargrit.evaluation.verdict import Column, column_of, notes_on_floors
 from lidargrit.viewer._page import document
+from lidargrit.viewer.report_charts import REAL_AGAINST_REAL
 from lidargrit.viewer.report_style import STYLE
-from lidargrit.viewer.score_table import REAL_AGAINST_REAL
 
 _COSTS = {
     "parameters": "parameters",
@@ -105,7 +106,7 @@ def _table(cards: Sequence[NamedCard], costs: Mapping[str, dict[str, Any]]) -> s
         '<div class="wide" tabindex="0" role="region" aria-label="scores and costs"><table><thead><tr>'
         f"{head}</tr></thead><tbody>{body}</tbody><tfoot>{_real_against_real(scores, columns)}</tfoot></table></div>\n"
         f"{''.join(f'<p>{escape(note)}</p>' for note in notes_on_floors(cards[0][1].scores))}"
-        f"{''.join(map(_block, judged.differences))}"
+        f"{''.join(map(_differences, judged.differences))}"
     )
 
 
@@ -119,15 +120,15 @@ def _head(column: Column, more: str = "") -> str:
     return f"{escape(column[0])}<br><small>{escape(column[1])}{more}</small>"
 
 
-def _block(block: TableBlock) -> str:
+def _differences(table: Table) -> str:
     """Return a table of differences, below that of the scores."""
-    heads = "".join(f'<th scope="col">{head}</th>' for head in ("system", *map(_head, block.columns)))
+    heads = "".join(f'<th scope="col">{escape(head)}</th>' for head in table.head)
     rows = ""
-    for name, values in block.rows:
+    for name, *values in table.rows:
         cells = "".join(f'<td class="number">{escape(value)}</td>' for value in values)
         rows += f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>'
     return (
-        f'<p>{escape(block.title)}</p>\n<div class="wide" tabindex="0" role="region" aria-label="differences"><table>'
+        f'<p>{escape(table.title)}</p>\n<div class="wide" tabindex="0" role="region" aria-label="differences"><table>'
         f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>\n"
     )
 

@@ -20,8 +20,7 @@ from typing import Any, Literal
 from lidargrit.core import errors
 from lidargrit.core.errors import DataError, LidarGritError
 from lidargrit.core.processes import module_command
-from lidargrit.viewer.serve.limits import Limits
-from lidargrit.viewer.serve.requests import SampleRequest, SamplingSetting
+from lidargrit.viewer.serve.requests import Limits, SampleRequest, SamplingSetting
 
 State = Literal["waiting", "running", "done", "failed"]
 

@@ -125,12 +125,7 @@ def _settings_of(generator: Generator) -> list[dict[str, Any]]:
 
 
 def compute_result(generator: Generator, request: SampleRequest, variant: ProjectionVariant = "exact") -> list[ScanSet]:
-    """Sample new scans, or complete, upsample, drop or reconstruct a scan that is uploaded or an example.
-
-    Args:
-        request: task and settings that the page sent.
-        variant: variant of the projection that the model learned from.
-    """
+    """Sample new scans, or complete, upsample, drop or reconstruct a scan that is uploaded or an example."""
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
     own = generator.completion_sampling() if request.has_scan else generator.Sampling()
     sampling = dataclasses.replace(own, **request.sampling) if request.sampling else None
