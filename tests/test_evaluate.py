@@ -17,8 +17,7 @@ from lidargrit.core.table import render
 from lidargrit.data.images import Pixels, Provenance
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_source
-from lidargrit.evaluation.command import read_config
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources, read_config
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import pair_for_protocol

@@ -88,12 +88,7 @@ class Benchmark:
         return with_budget(preset, self.flops) if self.flops else preset
 
 
-def run(
-    systems: Sequence[str],
-    folder: Path,
-    benchmark: Benchmark,
-    processes: int = 1,
-) -> list[Path]:
+def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: int = 1) -> list[Path]:
     """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:

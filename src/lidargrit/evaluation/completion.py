@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -28,6 +28,7 @@ PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
 """Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""
 BASELINE = "triangulation"
 VOXEL_M = 0.1
+Measure = Callable[[RangeImage, RangeImage, Bool[Tensor, "H W"]], float]  # of two images, over hidden pixels
 _HEAD = ("model", "MAE [m]", "MAE - triangulation [m]", "found", "IoU", "drop runs", "diversity [m]", "s/scan")
 _HEAD += ("reflectance MAE", "class accuracy", "mIoU")
 
@@ -76,11 +77,7 @@ class CompletionScore:
 
 
 def compare_completion(
-    images: RangeImages,
-    models: Sequence[Model],
-    patterns: Sequence[Pattern],
-    completions: int = 2,
-    seed: int = 0,
+    images: RangeImages, models: Sequence[Model], patterns: Sequence[Pattern], completions: int = 2, seed: int = 0
 ) -> list[CompletionScore]:
     """Hide parts of scans, have every model fill them in, and compare.
 
@@ -167,19 +164,17 @@ def _score(
     filled = [_complete(model, condition, turn, seed) for turn in range(turns)]
     seconds = (time.perf_counter() - begin) / (len(whole) * turns)
     hidden = ~condition.return_observed
-    errors = [_mean([_error_m(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
-    found = [_mean([_found(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
-    ious = [_mean([_iou(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
-    apart = [
-        _mean([_error_m(one[i], other[i], hidden[i]) for one, other in combinations(filled, 2)])
-        for i in range(len(whole))
-    ]
+
+    def each(measure: Measure, pairs: Sequence[tuple[RangeImage, RangeImage]]) -> list[float]:
+        """Return the mean over pairs of batches of what is measured of each scan."""
+        return [_mean([measure(one[i], other[i], hidden[i]) for one, other in pairs]) for i in range(len(whole))]
+
+    with_truth = [(images, whole) for images in filled]
+    errors, of_reflectance = each(_error_m, with_truth), each(_reflectance_error, with_truth)
+    apart = each(_error_m, [*combinations(filled, 2)])
     classes = [_confusion(filled[0][i], whole[i], hidden[i]) for i in range(len(whole))]
     confusions = [one for one in classes if one is not None]
     bright = whole.reflectance is not None and filled[0].reflectance is not None
-    of_reflectance = [
-        _mean([_reflectance_error(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))
-    ]
     runs = load_metric("drop_run_lengths")()
     runs.update(filled[0], real=False)
     runs.update(whole, real=True)
@@ -188,8 +183,8 @@ def _score(
         pattern.text,
         len(whole),
         Estimate.of(errors),
-        Estimate.of(found),
-        Estimate.of(ious),
+        Estimate.of(each(_found, with_truth)),
+        Estimate.of(each(_iou, with_truth)),
         runs.compute().value,
         Estimate.of(apart) if turns > 1 else None,
         seconds,
@@ -223,15 +218,17 @@ def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
 
 
 def _error_m(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
-    both = hidden & one.return_mask & other.return_mask
-    return float((one.range_m - other.range_m)[both].double().abs().mean()) if bool(both.any()) else math.nan
+    return _mean_error(one.range_m, other.range_m, hidden & one.return_mask & other.return_mask)
 
 
-def _reflectance_error(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
-    both = hidden & filled.return_mask & true.return_mask
-    if filled.reflectance is None or true.reflectance is None or not bool(both.any()):
+def _reflectance_error(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
+    if one.reflectance is None or other.reflectance is None:
         return math.nan
-    return float((filled.reflectance - true.reflectance)[both].double().abs().mean())
+    return _mean_error(one.reflectance, other.reflectance, hidden & one.return_mask & other.return_mask)
+
+
+def _mean_error(one: Float[Tensor, "H W"], other: Float[Tensor, "H W"], both: Bool[Tensor, "H W"]) -> float:
+    return float((one - other)[both].double().abs().mean()) if bool(both.any()) else math.nan
 
 
 def _found(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:

@@ -170,11 +170,7 @@ def merged(generated: Sequence[Part], real: Sequence[Part], whole: Metric | None
 
 
 def interval_of(
-    value: float,
-    whole: Metric,
-    generated: Sequence[Part],
-    real: Sequence[Part],
-    resampling: Resampling,
+    value: float, whole: Metric, generated: Sequence[Part], real: Sequence[Part], resampling: Resampling
 ) -> Interval | None:
     """Return the confidence interval of the score of the whole sets; None if there are too few scans."""
     if min(len(generated), len(real)) < _AT_LEAST:
@@ -216,11 +212,7 @@ def spread_of(half_values: Sequence[float], groups: int, together: int = 1) -> t
 
 
 def real_against_real(
-    whole: Metric,
-    real: Sequence[Part],
-    real_as_generated: Sequence[Part],
-    sizes: Sequence[int],
-    resampling: Resampling,
+    whole: Metric, real: Sequence[Part], real_as_generated: Sequence[Part], sizes: Sequence[int], resampling: Resampling
 ) -> RealAgainstReal | None:
     """Return the mean score of one half of the reference against the other; None if there are too few scans."""
     if len(real) < _AT_LEAST:

@@ -89,10 +89,7 @@ def _as_text(estimate: Estimate) -> str:
 
 
 def score_likelihood(
-    generator: Generator,
-    images: RangeImages,
-    step_mm: int = 10,
-    maps: Path | None = None,
+    generator: Generator, images: RangeImages, step_mm: int = 10, maps: Path | None = None
 ) -> Likelihood:
     """Return the bits of all images of a set; every scan is coded by itself.
 
@@ -154,12 +151,7 @@ def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[BinaryIO | 
 
 
 def measure_source(
-    text: str,
-    model: str,
-    step_mm: int,
-    config: DataConfig,
-    maps: Path | None = None,
-    device: str = "",
+    text: str, model: str, step_mm: int, config: DataConfig, maps: Path | None = None, device: str = ""
 ) -> tuple[str, dict[str, Any]]:
     """Measure the scans of a source by a finished run: their bits, and the errors of their reconstructions.
 

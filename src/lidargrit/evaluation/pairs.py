@@ -118,11 +118,7 @@ class EvalPair:
 
 
 def pair_for_protocol(
-    samples: Source,
-    reference: Source,
-    protocol: Protocol,
-    config: DataConfig,
-    sensor: SensorModel | None = None,
+    samples: Source, reference: Source, protocol: Protocol, config: DataConfig, sensor: SensorModel | None = None
 ) -> EvalPair:
     """Read two sets as a protocol wants them.
 

@@ -1,11 +1,18 @@
-"""Drops of a model on clean scans, and independent drops → distances of their curves from those of true drops."""
+"""Simulated streets, or a model that drops returns of clean scans → distances of their curves from real ones."""
+
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.table import render
+from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
-from lidargrit.evaluation.realism import CurveScore, SimulatedScans, score_curves
+from lidargrit.data.sources import DatasetSource, open_source
+from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.protocols import public_name
+from lidargrit.evaluation.realism import CurveScore, SimulatedScans, compare, scans_of_both, score_curves, tables
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import Observed
@@ -20,6 +27,37 @@ RAYDROP_CURVES = (
     "drop_correlation",
 )
 """Curves that depend on which rays return, each a Jensen-Shannon distance."""
+
+
+def streets_of(samples: str, config: EvalConfig) -> Streets | None:
+    """Return the simulated streets that the protocol ``streets`` scores; None for other samples and protocols."""
+    if public_name(config.protocol) != "streets" or not samples.startswith("simulated"):
+        return None
+    source = open_source(samples, config.data.bad_points)
+    streets = source.scans() if isinstance(source, DatasetSource) else None
+    return streets if isinstance(streets, Streets) else None
+
+
+def evaluate_streets(
+    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str
+) -> tuple[str, dict[str, Any], list[CurveScore]]:
+    """Compare simulated streets, and independent drops of their clean scans, with real scans.
+
+    Args:
+        model: run that drops returns of clean scans, which is compared too; none if empty.
+
+    Returns:
+        tables, their plain values, and the curves, which can be plotted.
+    """
+    drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
+    simulated, real = scans_of_both(
+        streets, open_source(reference, config.data.bad_points), config.sensor, config.data_config()
+    )
+    of_model = scores_of_model(drops, simulated, real) if drops else []
+    scores = compare(simulated, real)
+    about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
+    found = {"curves": [each.to_json() for each in scores], "raydrop": [each.to_json() for each in of_model]}
+    return render(tables([*scores, *of_model])), {**about, **found}, scores
 
 
 def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: RangeImage) -> list[CurveScore]:

@@ -138,11 +138,6 @@ class ReconstructionScore:
         self._of_scans = self._of_scans + torch.stack([of.sum() for of in errors_of_scans(*pairs).values()])
         self._scans_with_returns += int(has_returns.sum())
 
-    def merge(self, other: "ReconstructionScore") -> None:
-        """Take in what another process has gathered."""
-        for key, value in vars(other).items():
-            setattr(self, key, getattr(self, key) + value)
-
     def compute(self) -> ReconstructionErrors:
         """Return the errors over all pairs so far."""
         num_returns = self._only_decoded + self._neither

@@ -86,10 +86,7 @@ class _FedMetric:
 
 
 def score_metrics(
-    factories: Sequence[MetricFactory],
-    pair: EvalPair,
-    resampling: Resampling,
-    with_pixel_statistics: bool = False,
+    factories: Sequence[MetricFactory], pair: EvalPair, resampling: Resampling, with_pixel_statistics: bool = False
 ) -> list[Score | LidarGritError]:
     """Score two sets by several metrics.
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec, SubplotSpec
@@ -14,7 +13,7 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.evaluation.realism import CurveScore
-from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
+from lidargrit.viewer._matplotlib import write_png
 
 _WIDTH, _ROW, _HEAD = 14.0, 3.4, 0.6  # inches: the picture, a row of panels, the title
 _SIDES = {
@@ -38,8 +37,7 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
     deep = [score for score in scores if _curve(score, "real").ndim == 2]
     rows = -(-len(flat) // 2) + len(deep)
     height = _HEAD + _ROW * rows
-    figure = Figure(figsize=(_WIDTH, height), dpi=DOTS_PER_INCH)
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(_WIDTH, height))
     grid = GridSpec(
         rows, 2, figure, left=0.06, right=0.98, top=1 - (_HEAD + 0.35) / height, bottom=0.55 / height,
         hspace=0.6, wspace=0.16,

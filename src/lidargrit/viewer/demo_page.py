@@ -2,7 +2,8 @@
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from html import escape
 from pathlib import Path
 from typing import NamedTuple
@@ -14,10 +15,15 @@ from matplotlib import colormaps
 
 from lidargrit.core.files import write_text
 from lidargrit.core.version import __version__
+from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.reconstruction import ReconstructionErrors
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.generation.pixel_decoder.pixel_phases import Lattice
+from lidargrit.generation.generator import Generator
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, completed_lattices
+from lidargrit.nn.random import rngs_of
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
+from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.viewer import interactive
 from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.interactive import button
@@ -26,6 +32,7 @@ from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate
 from lidargrit.viewer.report_style import STYLE
 from lidargrit.viewer.scan_sets import ScanSet
 
+_SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 _LATTICES_SHOWN = 4  # the finest: of coarser ones a picture has a handful of pixels
 _EVERY_PIXEL = Lattice(1, 1)
 _PIECE = 6, 16  # rows and columns of tokens that are shown as numbers: as many as can be read
@@ -54,38 +61,92 @@ code{overflow-wrap:anywhere}
 
 @dataclass(frozen=True, eq=False)
 class DemoPage:
-    """Content of the page.
+    """What a page is made of; it follows the first held-out scan through the networks.
 
     Args:
         kind: kind of the scans: "real" or "simulated".
-        scan: a batch of this one scan; the model was not trained on it.
-        tokens: tokens of the scan.
-        decoded: ranges and probabilities of a return, decoded from the tokens.
-        sampled: range image decoded from the tokens, with a sampled return mask.
-        by_phases: range image that a pixel decoder sampled from the same tokens; None for a model without one.
-        lattices: lattices of the pixel decoder, each with the number of phases after which it is complete.
-        sets: sets of scans to turn side by side.
+        real: training scans, of which the nearest to each new scan stands beside it.
+        val: held-out scans.
+        samples: scans that the generator sampled.
         errors: errors of reconstruction over all held-out scans.
-        card: scores of new scans against held-out scans, with real against real and pixel statistics.
+        card: scores of the samples against held-out scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
         run: folder of the run.
+        sampling: settings by which pixels of reconstructed scans are sampled, as those of ``samples`` were.
     """
 
+    generator: Generator
     kind: str
-    name: str
-    scan: RangeImage
-    tokens: TokenGrid
-    decoded: Decoded
-    sampled: RangeImage
-    by_phases: RangeImage | None
-    lattices: Sequence[tuple[Lattice, int]]
-    sets: Sequence[ScanSet]
+    real: RangeImages
+    val: RangeImages
+    samples: RangeImages
     errors: ReconstructionErrors
     card: Scorecard
     seconds: Mapping[str, float]
     facts: Sequence[str]
     run: Path
+    sampling: TokenSampling = field(default_factory=TokenSampling)
+
+    @cached_property
+    def scan(self) -> RangeImage:
+        """A batch of the first held-out scan, which the model was not trained on."""
+        return self.val.batch([0])
+
+    @cached_property
+    def name(self) -> str:
+        """The name of this scan."""
+        return _name(self.val, 0)
+
+    @cached_property
+    def tokens(self) -> TokenGrid:
+        """Tokens of the scan."""
+        return self.generator.get_tokenizer().encode(self.scan)
+
+    @cached_property
+    def decoded(self) -> Decoded:
+        """Ranges and probabilities of a return, decoded from the tokens."""
+        return self.generator.get_tokenizer().decode(self.tokens)
+
+    @cached_property
+    def sampled(self) -> RangeImage:
+        """Range image decoded from the tokens, with a sampled return mask."""
+        return self.generator.get_tokenizer().sample(self.tokens, rngs_of([0]))
+
+    @cached_property
+    def pixels(self) -> PixelDecoder | None:
+        """The pixel decoder; None for a model without one."""
+        return self.generator.pixels if isinstance(self.generator, LidarGrit) else None
+
+    def sets(self) -> list[ScanSet]:
+        """Return new scans, and the training scan nearest to each."""
+        new = self.samples.batch(range(min(_SCANS_OF_A_SET, len(self.samples))))
+        nearest = nearest_scans(new, self.real)
+        names = tuple(_name(self.real, index) for index in nearest)
+        return [
+            ScanSet("new", new, tuple(f"seed {seed}" for seed in range(len(new))), generated=True),
+            ScanSet(f"nearest {self.kind} scan of training", self.real.batch(nearest), names),
+        ]
+
+
+def _name(images: RangeImages, index: int) -> str:
+    return images.provenance.names[index].rpartition("/")[2]
+
+
+def nearest_scans(new: RangeImage, real: RangeImages) -> list[int]:
+    """Return for each new scan the index of the real one whose logarithms of range differ least from its own."""
+    logs = new.range_m.log1p()
+    differences = [(logs - real.batch([index]).range_m.log1p()).abs().mean((1, 2)) for index in range(len(real))]
+    return torch.stack(differences).argmin(0).tolist()
+
+
+def reconstructed(generator: Generator, images: RangeImage, sampling: TokenSampling) -> RangeImage:
+    """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
+    tokenizer = generator.get_tokenizer()
+    tokens, rngs = tokenizer.encode(images), rngs_of(range(len(images)))
+    if isinstance(generator, LidarGrit) and generator.pixels is not None:
+        return generator.pixels.sample(tokenizer.decode(tokens), rngs, sampling.pixels())
+    return tokenizer.sample(tokens, rngs)
 
 
 def write_demo_page(demo: DemoPage, path: Path) -> None:
@@ -93,14 +154,15 @@ def write_demo_page(demo: DemoPage, path: Path) -> None:
     write_text(path, page(demo))
 
 
+@torch.no_grad()
 def page(demo: DemoPage) -> str:
     """Return the page as text; names of files and other foreign text are escaped."""
     steps = [_new_scans, _the_scan, _its_tokens, _its_reconstruction, _its_raydrop, _its_phases, _scores, _timings]
-    if demo.by_phases is None:
+    if demo.pixels is None:
         steps.remove(_its_phases)
     parts = [_lead(demo), *(_step(f"{number}. ", *step(demo)) for number, step in enumerate(steps, 1)), _next(demo)]
     looks = f"{interactive.style()}{STYLE}{_STYLE}"
-    title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets)
+    title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets())
     script = interactive.opening_script() + "page.turn();\n"
     return document(title, looks, "\n".join(parts), script, scans, "data: blob:")
 
@@ -259,17 +321,18 @@ def _its_raydrop(demo: DemoPage) -> _Step:
 
 
 def _its_phases(demo: DemoPage) -> _Step:
-    whole = demo.by_phases
-    assert whole is not None
+    assert demo.pixels is not None
+    whole = reconstructed(demo.generator, demo.scan, demo.sampling)
+    lattices = completed_lattices(demo.pixels.mask.phases)
     text = (
         "So far every ray is dropped by itself and every edge is blurred, because the decoder gives each pixel one "
         "distance and one probability. A third network, the pixel decoder, samples the pixels of the same tokens in "
-        f"{demo.lattices[-1][1]} phases from coarse to fine: first the return mask, then the distances. Each pixel is "
+        f"{lattices[-1][1]} phases from coarse to fine: first the return mask, then the distances. Each pixel is "
         "sampled given all pixels of the phases before it. So dropped rays cluster as real ones do, and a point at an "
         "edge lies on the near surface or on the far one, not between them."
     )
     masks, ranges = [], []
-    for lattice, count in demo.lattices[-_LATTICES_SHOWN:]:
+    for lattice, count in lattices[-_LATTICES_SHOWN:]:
         after = f"after {count} phase" + ("s" if count > 1 else "")
         mask = whole.return_mask[(0, *lattice.pixels)].float().numpy()
         masks.append(figure(rate_picture(mask), f"return mask {after}"))

@@ -152,9 +152,9 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
     numbers = _numbers_of_classes(scan_set)
     named = names_and_colours(numbers)
     scans: list[dict[str, Any]] = []
-    for index, (name, hidden) in enumerate(zip(scan_set.scan_names, scan_set.hidden(), strict=True)):
-        image = images[index]
-        beside = scan_set.beside[index] if scan_set.shows_beside and scan_set.beside else None
+    for index, name in enumerate(scan_set.scan_names):
+        image, beside = images[index], scan_set.beside[index] if scan_set.beside else None
+        hidden = scan_set.hidden[index] if scan_set.hidden else 0
         steps = (image.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * image.return_mask
         scan = {"name": name, "range": _packed(steps.numpy().astype("<u2")), "hidden": hidden}
         if beside is not None:

@@ -26,13 +26,7 @@ from lidargrit.evaluation.profiles import (
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, EvalSetRecord, LeftOut, Scorecard
 from lidargrit.viewer._page import document, figure
 from lidargrit.viewer.report_charts import REAL_AGAINST_REAL, line_chart, score_table
-from lidargrit.viewer.report_pictures import (
-    NO_RETURN,
-    density_picture,
-    difference_picture,
-    range_picture,
-    rate_picture,
-)
+from lidargrit.viewer.report_pictures import NO_RETURN, density_picture, difference_picture, range_picture, rate_picture
 from lidargrit.viewer.report_style import STYLE
 
 _MATCHES = 3  # best, and as many worst
@@ -163,12 +157,7 @@ def _matches(samples: EvalSet, searched: EvalSet, limits_m: tuple[float, float])
         return "".join(
             '<div class="pair">'
             + _scan(samples, match.generated, limits_m, _name(samples, match.generated))
-            + _scan(
-                searched,
-                match.real,
-                limits_m,
-                f"nearest, at {match.distance:.3f}: {_name(searched, match.real)}",
-            )
+            + _scan(searched, match.real, limits_m, f"nearest, at {match.distance:.3f}: {_name(searched, match.real)}")
             + "</div>"
             for match in some
         )
