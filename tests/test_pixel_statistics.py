@@ -7,7 +7,7 @@ import torch
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
-from lidargrit.evaluation import pixel_statistics as module
+from lidargrit.evaluation import scoring as module
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet

@@ -27,9 +27,10 @@ class Table:
     sentences: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def filled(self) -> "Table":
-        """Return the table without the columns that no row fills."""
-        kept = [at for at, column in enumerate(zip(*self.rows, strict=True)) if any(column)]
+    def without_empty(self, *names: str) -> "Table":
+        """Return the table without those of the named columns that no row fills."""
+        columns = zip(self.head, *self.rows, strict=True)
+        kept = [at for at, (name, *cells) in enumerate(columns) if any(cells) or name not in names]
         head, *rows = (tuple(row[at] for at in kept) for row in (self.head, *self.rows))
         return replace(self, head=head, rows=tuple(rows))
 

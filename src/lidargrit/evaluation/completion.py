@@ -30,7 +30,7 @@ BASELINE = "triangulation"
 VOXEL_M = 0.1
 Measure = Callable[[RangeImage, RangeImage, Bool[Tensor, "H W"]], float]  # of two images, over hidden pixels
 _HEAD = ("model", "MAE [m]", "MAE - triangulation [m]", "found", "IoU", "drop runs", "diversity [m]", "s/scan")
-_HEAD += ("reflectance MAE", "class accuracy", "mIoU")
+_WHERE_KNOWN = ("reflectance MAE", "class accuracy", "mIoU")
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,8 @@ def tables(scores: Sequence[CompletionScore]) -> list[Table]:
     found = []
     for pattern in dict.fromkeys(score.observed for score in scores):
         rows = tuple(_row(score) for score in scores if score.observed == pattern)
-        found.append(Table(_HEAD, rows, f"observed: {pattern}").filled())
+        table = Table((*_HEAD, *_WHERE_KNOWN), rows, f"observed: {pattern}")
+        found.append(table.without_empty(*_WHERE_KNOWN))
     return found
 
 

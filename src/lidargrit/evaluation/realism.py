@@ -237,8 +237,8 @@ def tables(scores: Sequence[CurveScore]) -> list[Table]:
         first = of_kind[0]
         rows = [("scans compared", _counts(first.own), "", "", _counts(first.real_against_real))]
         for score in of_kind:
-            values = (f"{each.value:.4f}" for each in (score.own, score.bernoulli))
-            rows.append((score.own.metric, *values, f"{score.ratio:.2f}", f"{score.real_against_real.value:.4f}"))
+            own, bernoulli, real = (f"{of.value:.4f}" for of in (score.own, score.bernoulli, score.real_against_real))
+            rows.append((score.own.metric, own, bernoulli, f"{score.ratio:.2f}", real))
         found.append(Table((title, whose, "Bernoulli", "ratio", "real v real"), tuple(rows)))
     return found
 

@@ -165,7 +165,9 @@ class Scorecard:
             *(f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out),
         ]
         notes += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
-        return Table(_HEAD, tuple(rows), sentences=self.verdict.sentences, notes=tuple(notes)).filled()
+        return Table(_HEAD, tuple(rows), sentences=self.verdict.sentences, notes=tuple(notes)).without_empty(
+            "pixel statistics"
+        )
 
 
 def _row(score: Score) -> tuple[str, ...]:

@@ -5,11 +5,13 @@ from html import escape
 
 import numpy as np
 from jaxtyping import Float
+from markupsafe import Markup
 
 from lidargrit.evaluation.intervals import Score
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard, format_value
 from lidargrit.evaluation.verdict import notes_on_floors
+from lidargrit.viewer._page import part
 
 _WIDE, _TALL = 320, 34  # a score's chart
 _CHART_WIDE, _CHART_TALL = 720, 260
@@ -100,46 +102,12 @@ def line_chart(lines: Mapping[str, Float[np.ndarray, " n"]], x_label: str, y_lab
     )
 
 
-def score_table(card: Scorecard) -> str:
+def score_table(card: Scorecard) -> Markup:
     """Return the verdict on some scores, then their table, with a row for each metric that does not apply."""
     with_pixels = any(score.pixel_statistics is not None for score in card.scores)
     heads = [head for head in _HEADS if head != "pixel statistics" or with_pixels]
-    rows = "".join(_row(score, len(heads)) for score in card.scores)
-    rows += "".join(
-        f'<tr><th scope="row">{metric_title(each.metric, each.variant)}</th>'
-        f'<td colspan="{len(heads) - 1}">{NOT_APPLICABLE}</td></tr>'
-        for each in card.left_out
-        if each.verdict == NOT_APPLICABLE
-    )
-    sentences = "".join(f"<li>{escape(sentence)}</li>" for sentence in card.verdict.sentences)
-    columns = "".join(f'<th scope="col">{head}</th>' for head in heads)
-    return (
-        f'<ul class="verdict">{sentences}</ul>'
-        '<div class="wide scores" tabindex="0" role="region" aria-label="scores"><table><thead><tr>'
-        f"{columns}</tr></thead><tbody>{rows}</tbody></table></div>"
-        + "".join(f"<p>{escape(note)}</p>" for note in notes_on_floors(card.scores))
-    )
-
-
-def metric_title(name: str, variant: str) -> str:
-    """Return a metric's title with its name and variant below, for the head of a row."""
-    return f"{escape(load_metric(name).title)}<br><small>{escape(name)}, {escape(variant)}</small>"
-
-
-def _row(score: Score, columns: int) -> str:
-    result, interval, real, pixels = score.result, score.interval, score.real_against_real, score.pixel_statistics
-    between = f"{format_value(interval.low)} to {format_value(interval.high)}" if interval else "not known"
-    cells = [
-        format_value(result.value),
-        between,
-        f"{format_value(real.value)} <small>(n = {real.num_scans:,})</small>" if real else "not known",
-    ]
-    if columns == len(_HEADS):
-        cells.append("not known" if pixels is None else format_value(pixels))
-    named = zip(_HEADS[1:], cells, strict=False)
-    numbers = "".join(f'<td class="number" data-name="{name}">{cell}</td>' for name, cell in named)
-    better = "higher" if result.higher_is_better else "lower"
-    return (
-        f'<tr><th scope="row">{metric_title(result.metric, result.variant)}</th>{numbers}'
-        f'<td>{score_chart(score)}</td><td data-name="better">{better}</td></tr>'
-    )
+    names = [score.result.metric for score in card.scores]
+    names += [each.metric for each in card.left_out if each.verdict == NOT_APPLICABLE]
+    titles = {name: load_metric(name).title for name in names}
+    floors = notes_on_floors(card.scores)
+    return part("scores.html", card=card, heads=heads, titles=titles, floors=floors, chart=score_chart)
