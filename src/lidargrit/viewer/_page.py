@@ -3,6 +3,7 @@
 import base64
 import hashlib
 from html import escape
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -18,6 +19,11 @@ _TEMPLATES = Environment(
     lstrip_blocks=True,
 )
 _TEMPLATES.filters["value"] = format_value
+
+
+def asset(name: str) -> str:
+    """Return a style sheet or a script of ``browser/``; none names a file, or a font that a computer may lack."""
+    return (Path(__file__).parent / "browser" / name).read_text(encoding="utf-8")
 
 
 def part(template: str, **values: Any) -> Markup:

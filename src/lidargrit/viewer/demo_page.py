@@ -24,37 +24,15 @@ from lidargrit.nn.random import rngs_of
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.viewer import interactive
-from lidargrit.viewer._page import document, part
-from lidargrit.viewer.interactive import button
+from lidargrit.viewer._page import asset, document, part
 from lidargrit.viewer.report_charts import bar_chart, score_table
 from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate_picture
-from lidargrit.viewer.report_style import STYLE
 from lidargrit.viewer.scan_sets import ScanSet
 
 _SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 _LATTICES_SHOWN = 4  # the finest: of coarser ones a picture has a handful of pixels
 _EVERY_PIXEL = Lattice(1, 1)
 _PIECE = 6, 16  # rows and columns of tokens that are shown as numbers: as many as can be read
-_STYLE = """
-main{display:block;max-width:1240px}
-.lead{font-size:1.08rem;max-width:80ch}
-.step{margin-top:2.4em}
-.step>h2{margin:0 0 .3em;font-size:1.3rem}
-.step>p{max-width:85ch;margin:0 0 .8em}
-.head h2{margin:0;font-size:1rem}
-.three{display:grid;grid-template-columns:repeat(3,1fr);gap:4px 20px}
-.phases{display:grid;grid-template-columns:repeat(4,1fr);gap:4px 14px;margin-bottom:1em}
-.points{min-height:380px}
-.bar rect,rect.bar{fill:var(--b)}
-.tokens{width:100%;max-width:760px;font-family:ui-monospace,monospace}
-.grid{display:block;width:100%;height:170px;border-radius:3px}
-.grid image{image-rendering:pixelated}
-.facts{color:var(--soft);font-size:.92rem}
-#panes .about{font-size:.78rem;overflow:hidden;white-space:nowrap;text-overflow:ellipsis}
-figure img{max-height:170px}
-code{overflow-wrap:anywhere}
-@media (max-width:760px){.three,.phases{grid-template-columns:1fr}#panes .about{white-space:normal}}
-"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +148,11 @@ def page(demo: DemoPage) -> str:
         for lattice, count in completed_lattices(demo.pixels.mask.phases)[-_LATTICES_SHOWN:]:
             mask = whole.return_mask[(0, *lattice.pixels)].float().numpy()
             phases.append((count, rate_picture(mask), ranges(whole, lattice)))
-    saves = button("bin", ".bin") + button("ply", ".ply")
     likely, shown = demo.decoded.return_logits[0].sigmoid(), [mask[0].float() for mask in masks]
     content = part(
         "demo.html",
         demo=demo,
-        viewer=interactive.viewer_html("", f"Save {saves}", f"Made by lidargrit {__version__}."),
+        viewer=interactive.viewer_html({"bin": ".bin", "ply": ".ply"}, f"Made by lidargrit {__version__}.", "Save"),
         rows=demo.scan.sensor.height,
         columns=demo.scan.sensor.width,
         limits_m=(near, far),
@@ -189,7 +166,7 @@ def page(demo: DemoPage) -> str:
         timings=bar_chart(demo.seconds, "s"),
         run=shlex.quote(str(demo.run)),
     )
-    looks = f"{interactive.style()}{STYLE}{_STYLE}"
+    looks = interactive.style() + asset("report.css") + asset("demo.css")
     title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets())
     script = interactive.opening_script() + "page.turn();\n"
     return document(title, looks, content, script, scans, "data: blob:")

@@ -23,10 +23,9 @@ from lidargrit.evaluation.profiles import (
     searched_scans,
 )
 from lidargrit.evaluation.scorecard import EvalSetRecord, LeftOut, Scorecard
-from lidargrit.viewer._page import document, part
+from lidargrit.viewer._page import asset, document, part
 from lidargrit.viewer.report_charts import REAL_AGAINST_REAL, line_chart, score_table
 from lidargrit.viewer.report_pictures import NO_RETURN, density_picture, difference_picture, range_picture, rate_picture
-from lidargrit.viewer.report_style import STYLE
 
 _MATCHES = 3  # best, and as many worst
 _SHEET = 12  # samples on the sheet
@@ -71,7 +70,9 @@ def page(card: Scorecard, pair: EvalPair) -> str:
         settings=_settings(card),
         no_return=NO_RETURN,
     )
-    return document(f"{card.samples.source} against {card.reference.source}", STYLE, content, images="data:")
+    return document(
+        f"{card.samples.source} against {card.reference.source}", asset("report.css"), content, images="data:"
+    )
 
 
 def _for_others(card: Scorecard, without_raydrop: str) -> tuple[Scorecard, str]:

@@ -8,9 +8,8 @@ from lidargrit.core.errors import without_folders
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import NamedCard, comparable, judge
 from lidargrit.evaluation.verdict import column_of, notes_on_floors
-from lidargrit.viewer._page import document, part
+from lidargrit.viewer._page import asset, document, part
 from lidargrit.viewer.report_charts import REAL_AGAINST_REAL
-from lidargrit.viewer.report_style import STYLE
 
 _COSTS = {
     "parameters": "parameters",
@@ -20,34 +19,6 @@ _COSTS = {
     "seconds_per_scan": "seconds a scan",
     "bits_per_return": "bits a return",
 }
-_SCRIPT = """
-for (const button of document.querySelectorAll("th button")) button.addEventListener("click", () => {
-  const head = button.parentElement, body = head.closest("table").tBodies[0], index = head.cellIndex;
-  const up = head.getAttribute("aria-sort") !== "ascending";
-  for (const other of head.parentElement.children) other.removeAttribute("aria-sort");
-  head.setAttribute("aria-sort", up ? "ascending" : "descending");
-  const key = (row) => row.cells[index].dataset.value ?? row.cells[index].textContent;
-  const compare = (a, b) => {
-    const [x, y] = [key(a), key(b)];
-    if (x === "" || y === "") return (x === "") - (y === "");  // cells without a number stay at the end
-    const order = isNaN(x) || isNaN(y) ? x.localeCompare(y) : x - y;
-    return up ? order : -order;
-  };
-  body.append(...[...body.rows].sort(compare));
-});
-"""
-_LOOKS = """
-th button{all:unset;cursor:pointer;font-weight:600}
-th button:hover{text-decoration:underline}
-th button:focus-visible{outline:3px solid var(--b);outline-offset:2px}
-th[aria-sort=ascending] button::after{content:" \\25B2"}
-th[aria-sort=descending] button::after{content:" \\25BC"}
-main{max-width:none}
-tbody th{white-space:nowrap}
-td small{display:block}
-tr>:first-child{position:sticky;left:0;background:var(--paper);border-right:1px solid var(--line)}
-tfoot td,tfoot th{color:var(--soft)}
-"""
 
 
 def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
@@ -73,7 +44,9 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         tables=[_table(cards, costs) for cards in tables],
         costs=list(_COSTS.values()),
     )
-    return document(f"{_systems(len(cells))} compared", STYLE + _LOOKS, content, _SCRIPT)
+    return document(
+        f"{_systems(len(cells))} compared", asset("report.css") + asset("table.css"), content, asset("table.js")
+    )
 
 
 def _systems(count: int) -> str:

@@ -29,7 +29,7 @@ from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.viewer import interactive
-from lidargrit.viewer.interactive import button, filled
+from lidargrit.viewer._page import asset, part
 from lidargrit.viewer.serve.jobs import Job, JobQueue
 from lidargrit.viewer.serve.requests import (
     EXAMPLES,
@@ -61,8 +61,6 @@ _HEADERS = [
 ]
 
 Environment = dict[str, Any]
-_FOLDER = Path(__file__).parent / "browser"
-_SAVED = ("npz", "ply", "bin")
 
 
 class Response(NamedTuple):
@@ -266,32 +264,22 @@ def _is_number(name: str) -> bool:
 
 def page() -> str:
     """Return the page without models and scans, which its script requests from the server."""
-    buttons = "".join(button(kind, f".{kind}") for kind in _SAVED) + button("remove", "Remove")
-    parts = {
-        "viewer": interactive.viewer_html("", f'<span class="soft">Save</span>{buttons}', f"lidargrit {__version__}."),
-        "tasks": "".join(f'<button name="task" value="{name}">{text}</button>' for name, text in TASKS.items()),
-        "examples": "".join(_example(name) for name in EXAMPLES),
-        "seed_at_most": str(SEED_AT_MOST),
-        "endings": ",".join(upload_endings()),
-        "listed_endings": ", ".join(upload_endings()),
-    }
-    return filled(_read("serve.html"), parts)
+    buttons = {kind: f".{kind}" for kind in _WRITERS} | {"remove": "Remove"}
+    return part(
+        "serve.html",
+        viewer=interactive.viewer_html(buttons, f"lidargrit {__version__}.", label="Save"),
+        tasks=TASKS,
+        examples=EXAMPLES,
+        seed_at_most=SEED_AT_MOST,
+        endings=upload_endings(),
+    )
 
 
 def script() -> str:
     """Return the scripts of the page."""
-    return interactive.scripts() + _read("serve.js")
+    return interactive.scripts() + asset("serve.js")
 
 
 def style() -> str:
     """Return the style sheet of the page."""
-    return interactive.style() + _read("serve.css")
-
-
-def _example(name: str) -> str:
-    example = EXAMPLES[name]
-    return f'<button type="button" data-example="{name}" data-task="{example.task}">{example.words}</button>'
-
-
-def _read(name: str) -> str:
-    return (_FOLDER / name).read_text(encoding="utf-8")
+    return interactive.style() + asset("serve.css")
