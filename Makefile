@@ -16,7 +16,9 @@ environment: .venv/.complete
 demo: .venv/.complete
 	$(BIN)/lidargrit demo $(if $(DATA),--data "$(DATA)") $(if $(OUT),--out "$(OUT)")
 
+# Commands that tests kill may leave no bytecode behind, so it is made before.
 test: check
+	$(BIN)/python -m compileall -q src
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 check: .venv/.complete

@@ -170,6 +170,8 @@ def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys):
     module = _program(path)
     for name in {"STEPS", "COUNT"} & vars(module).keys():
         setattr(module, name, 3)  # what is shown takes seconds more
+    if "MODEL" in vars(module):
+        module.MODEL = str(tiny_run)
     runs = [str(tiny_run)] if "run" in inspect.signature(module.main).parameters else []
     module.main(tmp_path, *runs)
     assert capsys.readouterr().out
