@@ -51,8 +51,6 @@ class Benchmark:
 
     Args:
         reference: source of real scans on which none of the systems was trained.
-        num_samples: number of samples of each system.
-        settings: settings of the evaluation, above all its protocol.
         preset_settings: settings that are given to every preset, as by ``train --set``, so that all systems get the
             same data.
         flops: operations of the training of each system; 0 keeps every preset's own budget.
@@ -296,10 +294,8 @@ class _Plan:
     """How one system is made: from a finished run, or by training a preset; or its samples, which are there.
 
     Args:
-        system: name of the system, as the user typed it.
         run: folder of a finished run, or of the one that the preset gets, or of samples.
         preset: preset that is trained; None for a finished run.
-        samples: the samples, if they are there; None otherwise.
     """
 
     system: str

@@ -43,7 +43,6 @@ class CompletionScore:
     Args:
         model: name of the model or method, as the user typed it.
         observed: pattern of the observed pixels.
-        num_scans: number of scans.
         mae_m: mean absolute error of the range, over pixels that return in both scans; lower is better.
         found: share of the true hidden returns where the completed scan has a return, too; ``mae_m`` covers only these.
         iou: intersection over union of the 0.1 m voxels that hold a point; higher is better.

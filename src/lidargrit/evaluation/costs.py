@@ -32,12 +32,7 @@ _NOTES = (
 
 @dataclass(frozen=True)
 class Costs:
-    """The file with what one system costs.
-
-    Args:
-        path: the file, ``costs.json``.
-        weights_sha256: hash of the weights of the system's run.
-    """
+    """The file with what one system costs."""
 
     path: Path
     weights_sha256: str

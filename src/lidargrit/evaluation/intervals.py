@@ -66,8 +66,6 @@ class Interval:
             Student's 97.5 % quantile: 2.13 for 16 groups and 20 halves (1.96 for many), since few halves give only a
             rough standard error.
         high: value plus t standard errors, clipped to the metric's bounds.
-        standard_error: standard deviation of the scores of half-samples.
-        halves: number of half-samples.
         mean_of_halves: mean score of half-samples, which have as many scans as the halves of real against real; None in
             files of earlier versions.
         values: scores of the half-samples; none in files of earlier versions. Systems that were scored alike, against
@@ -90,7 +88,6 @@ class RealAgainstReal:
         value: mean over halvings of the reference, one half against the other.
         num_scans: number of scans in each half, on average. Most metrics fall as sets grow, some by a third where they
             double: so compare it with ``Interval.mean_of_halves``.
-        halvings: number of halvings.
         spread: standard deviation of the scores of single halvings; None in files of earlier versions.
     """
 
@@ -105,7 +102,6 @@ class Score:
     """One score with its interval and its reference rows.
 
     Args:
-        result: value of the metric.
         interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
         seconds: time that the metric, its interval and real against real took.

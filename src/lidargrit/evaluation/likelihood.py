@@ -38,9 +38,7 @@ class Likelihood:
 
     Args:
         is_whole: whether the bits name the whole scan, or only its tokens.
-        names: name of each scan.
         parts: bits of each scan, by the name of the part: ``tokens``, ``mask``, ``range``.
-        returns: number of returns of each scan.
         pixels: number of pixels of a scan, which is the same for all.
     """
 

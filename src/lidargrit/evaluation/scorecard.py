@@ -21,9 +21,6 @@ class LeftOut:
     """A metric of the protocol that could not be computed.
 
     Args:
-        metric: name of the metric.
-        variant: variant of the metric.
-        why: reason in one line.
         verdict: words in place of the number: ``left out``, or ``not applicable`` to sets of this kind.
     """
 
@@ -39,10 +36,6 @@ class EvalSetRecord:
 
     Args:
         data_set: name of the data set; "samples" for generated scans.
-        split: name of the split.
-        scans: number of scans of the set.
-        scans_used: number of scans that were compared.
-        projection: description of the projection of its scans.
         sha256: hash of the pixels that were compared.
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
     """
@@ -63,12 +56,9 @@ class Scorecard:
     """Result of an evaluation.
 
     Args:
-        protocol: name of the protocol.
         about: title, source, limits of range, number of scans, data set and departures of the protocol.
         samples: record of the first set, usually generated.
         reference: record of the second set, usually real.
-        scores: scores in the protocol's order.
-        left_out: metrics that could not be computed.
         deviations: differences of this evaluation from the protocol.
         warnings: sentences that a reader must know before trusting a score.
         settings: settings of the evaluation, as :meth:`EvalConfig.facts` returns them.

@@ -24,11 +24,7 @@ _PIXELS_AT_ONCE = 1 << 24  # shuffled in memory: 1,024 scans of 64x256
 
 @dataclass(frozen=True)
 class MetricFactory:
-    """Makes empty metrics of one definition.
-
-    Args:
-        choice: the metric with its variant.
-    """
+    """Makes empty metrics of one definition."""
 
     choice: MetricChoice
     seed: int = 0

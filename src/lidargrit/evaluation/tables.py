@@ -44,7 +44,6 @@ class Comparison:
     Args:
         differences: score of the one minus that of the other, by metric and variant; the 95 % of the intervals are of
             all metrics together, so that two equal systems seldom differ in any.
-        verdict: answer in words.
     """
 
     differences: Mapping[Column, Estimate]

@@ -42,13 +42,9 @@ class DemoPage:
     Args:
         kind: kind of the scans: "real" or "simulated".
         real: training scans, of which the nearest to each new scan stands beside it.
-        val: held-out scans.
-        samples: scans that the generator sampled.
-        errors: errors of reconstruction over all held-out scans.
         card: scores of the samples against held-out scans, with real against real and pixel statistics.
         seconds: time that each stage took, in seconds, by its name.
         facts: short sentences about the model and its training.
-        run: folder of the run.
         sampling: settings by which pixels of reconstructed scans are sampled, as those of ``samples`` were.
     """
 

@@ -67,9 +67,6 @@ class Response(NamedTuple):
     """The response to a request.
 
     Args:
-        status: HTTP status, such as "200 OK".
-        body: all bytes of the content.
-        media_type: media type of the content.
         file_name: name under which a browser saves the content; "" to show it.
     """
 
@@ -91,7 +88,6 @@ class Application:
     """The WSGI application of the server.
 
     Args:
-        queue: queue with the jobs of all clients.
         host: address at which it is served; the loopback's names are known besides.
     """
 

@@ -44,9 +44,7 @@ class JobQueue:
     """Runs jobs in the order in which they were submitted.
 
     Args:
-        runs: folders of finished runs.
         folder: an empty folder for uploads and results; the caller removes it.
-        limits: bounds on what may be asked for.
     """
 
     def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits | None = None) -> None:

@@ -69,7 +69,6 @@ class Example(NamedTuple):
 
     Args:
         words: text of its button on the page.
-        task: the task that its button asks for.
         sensor: name of the sensor that sees it; "" for that of the model.
         every_beam_returns: whether no beam is lost.
     """
@@ -95,9 +94,7 @@ class SamplingSetting:
 
     Args:
         name: name of the field in the generator's ``Sampling``.
-        whole: whether it is a whole number.
         default: default value; None where the generator computes one itself.
-        at_most: largest value that is accepted.
         about: description, from the docstring of ``Sampling``.
     """
 
@@ -115,7 +112,6 @@ class SampleRequest:
     Args:
         model: index of the model among those that are served.
         seed: seed of the first scan; the next scan has the next seed.
-        count: number of scans.
         sampling: values of the sampling settings that the client changed, by name.
         task: name of the work on the scan, a key of :data:`TASKS`.
         region: left, top, right and bottom edge of the region that is to be filled in, as shares of the image's width

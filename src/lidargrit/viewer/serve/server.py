@@ -30,8 +30,6 @@ class RunningServer(NamedTuple):
     """A server that listens.
 
     Args:
-        port: port at which it listens.
-        queue: queue with the jobs of all clients.
         run: function that answers requests until Ctrl-C.
         stop: function that ends ``run`` from another thread, and with it all connections.
     """
