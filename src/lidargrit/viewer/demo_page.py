@@ -25,7 +25,7 @@ from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
 from lidargrit.viewer import interactive
 from lidargrit.viewer._page import asset, document, part
-from lidargrit.viewer.report_charts import bar_chart, score_table
+from lidargrit.viewer.report_charts import score_table
 from lidargrit.viewer.report_pictures import colour_picture, range_picture, rate_picture
 from lidargrit.viewer.scan_sets import ScanSet
 
@@ -159,7 +159,6 @@ def page(demo: DemoPage) -> str:
         sampled=ranges(demo.sampled),
         phases=phases,
         scores=score_table(demo.card),
-        timings=bar_chart(demo.seconds, "s"),
         run=shlex.quote(str(demo.run)),
     )
     looks = interactive.style() + asset("report.css") + asset("demo.css")
