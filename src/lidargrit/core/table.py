@@ -39,7 +39,7 @@ class Table:
         grid = self._grid()
         widths = [max(map(len, column)) for column in zip(*grid, strict=True)]
         lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in grid]
-        above = [*filter(None, [self.title]), *self.sentences, *([""] if self.sentences and lines else [])]
+        above = [*filter(None, [self.title]), *self.sentences]
         return "\n".join([*map(printable, above), *lines, *map(printable, self.notes)])
 
     def as_markdown(self) -> str:

@@ -155,7 +155,7 @@ class Scorecard:
             *(f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out),
         ]
         notes += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
-        return Table(_HEAD, tuple(rows), sentences=self.verdict.sentences, notes=tuple(notes)).without_empty(
+        return Table(_HEAD, tuple(rows), sentences=(*self.verdict.sentences, ""), notes=tuple(notes)).without_empty(
             "pixel statistics"
         )
 
