@@ -52,9 +52,8 @@ class Table:
 
     def as_latex(self) -> str:
         """Return a ``tabular``, with sentences as comments."""
-        above, notes = (
-            [f"% {' '.join(each.split())}" for each in lines] for lines in ((self.title, *self.sentences), self.notes)
-        )
+        said = ((self.title, *self.sentences), self.notes)
+        above, notes = ([f"% {' '.join(each.split())}" for each in lines if each] for lines in said)
         if self.head:
             head, *rows = [" & ".join(map(_typeset, row)) + r" \\" for row in self._grid()]
             begin = rf"\begin{{tabular}}{{l{'r' * (len(self.head) - 1)}}}"

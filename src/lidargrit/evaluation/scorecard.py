@@ -144,20 +144,13 @@ class Scorecard:
 
     def as_table(self) -> str:
         """Return the scores as lines for a terminal: the verdict in words, then the numbers."""
-        return self.table().as_text()
-
-    def table(self) -> Table:
-        """Return the verdict in words and the scores, with reasons for what is missing."""
         rows = [_row(score) for score in self.scores]
         rows += [(each.metric, each.variant or "-", each.verdict, *[""] * 5) for each in self.left_out]
-        notes = [
-            *notes_on_floors(self.scores),
-            *(f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out),
-        ]
+        notes = notes_on_floors(self.scores)
+        notes += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
         notes += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
-        return Table(_HEAD, tuple(rows), sentences=(*self.verdict.sentences, ""), notes=tuple(notes)).without_empty(
-            "pixel statistics"
-        )
+        table = Table(_HEAD, tuple(rows), sentences=(*self.verdict.sentences, ""), notes=tuple(notes))
+        return table.without_empty("pixel statistics").as_text()
 
 
 def _row(score: Score) -> tuple[str, ...]:
