@@ -95,12 +95,8 @@ def _points(found: "Written", task: "Task") -> str:
 
 def _view(options: argparse.Namespace, found: "Written", model: "Model") -> str:
     out = f"'{options.out}'" if " " in str(options.out) else str(options.out)
-    if found.sensor_file is None:
-        return f"lidargrit view {out} --sensor {model.sensor.name} --set data.columns={_columns(model)}"
-    return f"lidargrit view {out} -o {options.out.name}.html"
-
-
-def _columns(model: "Model") -> str:
-    sensor = model.sensor
-    stride = f" data.column_stride={sensor.column_stride}" if sensor.column_stride > 1 else ""
-    return f"{sensor.width * sensor.column_stride}{stride}"
+    if found.sensor_file is not None:
+        return f"lidargrit view {out} -o {options.out.name}.html"
+    sensor, stride = model.sensor, model.sensor.column_stride
+    columns = f"data.columns={sensor.width * stride}" + (f" data.column_stride={stride}" if stride > 1 else "")
+    return f"lidargrit view {out} --sensor {sensor.name} --set {columns}"

@@ -91,13 +91,12 @@ class EvalConfig:
                 every = [MetricChoice(name, variant) for variant in cls.variants]
                 wanted += every if public_name(self.protocol) == DEFAULT or not its_own else its_own
         if self.variant:
-            _require_known(self.variant, wanted)
+            known = {name for choice in wanted for name in load_metric(choice.metric).variants}
+            if self.variant not in known:  # where some have it, the others are left out and say so
+                such = f"one such as {nearest_names(self.variant, known)}"
+                raise ConfigError(f"variant {self.variant!r}", such, "choose one of these")
             wanted = [replace(choice, variant=self.variant) for choice in wanted]
-        kept: list[MetricChoice] = []
-        for choice in wanted:
-            if choice not in kept:
-                kept.append(choice)
-        return kept
+        return list(dict.fromkeys(wanted))
 
     def data_config(self) -> DataConfig:
         """Return the settings by which scans of either set are read and projected, as the protocol or the user says."""
@@ -290,13 +289,6 @@ def _other_definitions(scores: Sequence[Score], protocol: Protocol) -> list[str]
         for metric, variants in computed.items()
         if metric in own and not set(variants) & set(own[metric])
     ]
-
-
-def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
-    """Refuse a variant that no wanted metric has; where some have it, the others are left out and say so."""
-    known = {name for choice in wanted for name in load_metric(choice.metric).variants}
-    if variant not in known:
-        raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
 
 
 def metric_factory(choice: MetricChoice, settings: EvalConfig) -> MetricFactory:

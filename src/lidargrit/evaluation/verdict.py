@@ -116,7 +116,10 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
     if scans < ENOUGH:
         return Verdict((), (too_few(scans), *said), objects)
     by_pixels = {column_of(score): _standing(score, score.pixel_statistics) for score in scores}
-    by_real = {column_of(score): _standing(score, _real(score)) for score in scores}
+    by_real = {
+        column_of(score): _standing(score, score.real_against_real and score.real_against_real.value)
+        for score in scores
+    }
     seeing = {column_of(score) for score in scores if tells_apart(score)}
     tallies = []
     if known_pixels := any(stands is not None for stands in by_pixels.values()):
@@ -225,10 +228,6 @@ def _standing(score: Score, bound: float | None) -> int | None:
         return None
     by = _worse_by(score, value, bound)
     return int(by > noise(score)) - int(-by > noise(score))
-
-
-def _real(score: Score) -> float | None:
-    return None if score.real_against_real is None else score.real_against_real.value
 
 
 def _worse_by(score: Score, value: float, other: float) -> float:
