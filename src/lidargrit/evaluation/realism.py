@@ -57,8 +57,8 @@ class CurveScore:
         own: distance of the simulated scans, or of those whose returns a model drops; they are the generated set of it.
         bernoulli: distance of clean scans from which returns are dropped with one constant probability.
         real_against_real: distance between the two halves of the true scans, which shows how much true scans differ.
-        scans: what a model drops returns of: ``simulated`` scans; ``real`` ones, with ranges that a tokenizer decodes;
-            or ``real_triangulated``, with ranges interpolated from other rays' returns. "" where no model does.
+        scans: kind of the scans whose returns a model drops: ``simulated``; ``real``, with ranges that a tokenizer
+            decodes; or ``real_triangulated``, with ranges interpolated from other rays' returns. "" for no model.
     """
 
     own: MetricResult

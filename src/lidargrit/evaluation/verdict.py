@@ -117,7 +117,7 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
         return Verdict((), (too_few(scans), *said), objects)
     by_pixels = {column_of(score): _standing(score, score.pixel_statistics) for score in scores}
     by_real = {
-        column_of(score): _standing(score, score.real_against_real and score.real_against_real.value)
+        column_of(score): _standing(score, real.value if (real := score.real_against_real) else None)
         for score in scores
     }
     seeing = {column_of(score) for score in scores if tells_apart(score)}
