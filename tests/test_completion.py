@@ -116,7 +116,7 @@ def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path,
     words = ["complete", f"{folders}/scans", str(tmp_path / "out"), "--observed", "rows:4"]
     words += ["--model", "triangulation", "--sensor", f"{folders}/sensor.json"]
     assert main(words) == 0
-    assert "done: 2 completed scans" in capsys.readouterr().out
+    assert "done: 2 scans" in capsys.readouterr().out
     for number in (1, 2):
         scan = NumpyArray.read(folders / "scans/drive" / f"{number}.npz")
         done = NumpyArray.read(tmp_path / "out/drive" / f"{number}.npz")

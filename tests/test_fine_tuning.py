@@ -35,6 +35,14 @@ def test_scans_seen_grow_with_the_scans_that_there_are_and_some_are_held_out(sca
     assert many.data.load_sensor().same_rays(lidargrit.load("pretrained").sensor)
 
 
+def test_of_scans_named_to_validate_on_none_is_held_out(scans, capsys):
+    one, other = "simulated:1:train", "simulated:1:val"
+    preset = fine_tuning_preset(one, val=other)
+    assert (preset.data.train, preset.data.val) == ((one,), (other,))
+    assert main(["fine-tune", one, str(scans.parent / "out"), "--val", "nowhere", "--dry-run"]) == 2
+    assert "got nowhere, which does not exist" in capsys.readouterr().err
+
+
 def test_images_of_another_sensor_of_64_rows_are_as_wide_as_the_models():
     own = lidargrit.load("pretrained").sensor
     assert columns_like(own, load_sensor("os1_64")) == (1024, 4)

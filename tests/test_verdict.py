@@ -46,10 +46,8 @@ def said(*scores, **more):
 
 @pytest.fixture(autouse=True)
 def every_metric_sees_objects(monkeypatch):
-    monkeypatch.setattr(
-        "lidargrit.evaluation.verdict.blind_to",
-        lambda metric, variant, scans: () if metric != "coverage" else ("boxes",),
-    )
+    unseen = {"coverage": ("boxes",)}
+    monkeypatch.setattr("lidargrit.evaluation.verdict.blind_to", lambda metric, *_: unseen.get(metric, ()))
 
 
 def test_a_metric_that_would_not_have_seen_damaged_objects_is_not_within_noise():
@@ -239,12 +237,8 @@ def test_equal_sets_that_do_not_score_0_have_their_floor_beside_them(tmp_path):
     assert unknown.endswith("is not known here")
     told = card(*variants)
     write_json(tmp_path / "a.json", told.to_json())
-    places = (
-        told.as_table(),
-        render(side_by_side([tmp_path / "a.json"])),
-        score_table(told),
-        _scores(told).replace("\\", ""),
-    )
+    beside = render(side_by_side([tmp_path / "a.json"]))
+    places = (told.as_table(), beside, score_table(told), _scores(told).replace("\\", ""))
     page = table_page([{"system": "a", "costs": {}, "scores": read_json(tmp_path / "a.json")}], 0.0)
     assert [words[1] in text for text in (*places, page)] == [True] * 5
 

@@ -77,8 +77,7 @@ def run_task(options: argparse.Namespace, model: "Model", task: "Task", probabil
     output = OutputConfig(options.samples, options.seed, options.format, probability)
     config = scan_settings(options, max_scans=options.count).data
     found = complete_scans(options.scans, options.out, model, task, output, config)
-    kind = {"complete": "completed", "upsample": "upsampled", "raydrop": "dropped"}[task.verb]
-    print(f"done: {counted_scans(found.scans, kind)} in {options.out}{_points(found, task)}")
+    print(f"done: {counted_scans(found.scans)} in {options.out}{_points(found, task)}")
     print(f"look at {'it' if found.scans == 1 else 'them'}: {_view(options, found, model)}")
 
 

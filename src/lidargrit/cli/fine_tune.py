@@ -13,8 +13,9 @@ EXAMPLES = """\
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(goes_on=True)
-    parser.add_argument("scans", help="scans: a folder, or NAME:ROOT:SPLIT; some of them are held out")
+    parser.add_argument("scans", help="scans to learn from: a folder, or NAME:ROOT:SPLIT")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
+    parser.add_argument("--val", metavar="SCANS", default="", help="scans to validate on (else some are held out)")
     add_scans(parser, "settings of the training to change, such as training.transformer.scans=2000")
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, and how long it takes")
 
@@ -26,7 +27,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.training.fine_tuning import fine_tuning_preset
 
     reporting.message("looking at the scans")
-    preset = fine_tuning_preset(options.scans, options.sensor, scan_words(options))
+    preset = fine_tuning_preset(options.scans, options.sensor, scan_words(options), options.val)
     check_folder(options.out, preset)
     plan = plan_training(preset)
     said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in plan.flops)

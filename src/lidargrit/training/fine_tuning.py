@@ -32,7 +32,11 @@ def divided(data: str, max_scans: int = 0) -> DataConfig:
     opened = open_source(data)
     dataset = opened.scans()
     if len(dataset) < 4:
-        raise DataError(f"{counted_scans(len(dataset))} in {data}", "at least 4, to hold one out", "add scans")
+        raise DataError(
+            f"{counted_scans(len(dataset))} in {data}",
+            "at least 4, to hold one out",
+            "add scans, or name some to validate on with --val",
+        )
     source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
     scans = Counter(dataset.name(index).rpartition("/")[0] for index in range(len(dataset)))
     drives = sorted(scans)
@@ -53,7 +57,14 @@ def divided(data: str, max_scans: int = 0) -> DataConfig:
     return DataConfig(train=(train,), val=(val,), sensor=opened.sensor_name, max_scans=max_scans)
 
 
-def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()) -> Preset:
+def _all_to_train(data: str, val: str) -> DataConfig:
+    train, held_out = (open_source(source) for source in (data, val))
+    train.scans()
+    held_out.scans()  # refused now, not after the first stage
+    return DataConfig(train=(data,), val=(val,), sensor=train.sensor_name)
+
+
+def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = (), val: str = "") -> Preset:
     """Return the preset that trains all networks of ``pretrained`` further on a user's scans.
 
     Stages and learning rates are those of ``lidargrit_demo_fine_tuned``. Scans seen grow with the number of scans that
@@ -64,8 +75,9 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
         data: name of a data set, or of a folder of scans.
         sensor: name or ``.json`` file of the sensor that made the scans; that of the data set if empty.
         settings: changed settings of the preset, as ``--set`` takes them.
+        val: scans to validate on; some of the scans are held out if empty.
     """
-    config = divided(data)
+    config = _all_to_train(data, val) if val else divided(data)
     own, made_by = load(PRETRAINED).sensor, load_sensor(sensor or config.sensor)
     columns, stride = columns_like(own, made_by)
     if made_by.height != own.height:

@@ -113,7 +113,7 @@ def write_completions(
     jobs = _jobs(inputs, folder, model, task, output)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, np.zeros(3, dtype=np.int64)
-    with folder.writing("completing") as progress:
+    with folder.writing(task.progress) as progress:
         for batch in _batches(chain(first, jobs), model.generator.compute_batch):
             for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
                 file = files[job.index * output.count + job.turn]

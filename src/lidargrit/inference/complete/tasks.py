@@ -25,6 +25,8 @@ class Task(ABC):
     """One of the verbs, as it treats one scan after the other."""
 
     verb: ClassVar[str]
+    progress: ClassVar[str]
+    """What progress lines call the work."""
     kind: ClassVar[ConditionKind] = "pixels"
     """Kind of the conditions that the model is given."""
     adds: ClassVar[bool] = True
@@ -71,6 +73,7 @@ class Fill(Task):
 
     pattern: Pattern
     verb: ClassVar[str] = "complete"
+    progress: ClassVar[str] = "completing"
 
     def reader(self, sensor: SensorModel, variant: ProjectionVariant) -> ScanReader:
         """Return one that takes a part of the circle where only returns are observed."""
@@ -101,6 +104,7 @@ class AddRows(Task):
 
     scans_sensor: SensorModel
     verb: ClassVar[str] = "upsample"
+    progress: ClassVar[str] = "upsampling"
 
     def reader(self, sensor: SensorModel, variant: ProjectionVariant) -> ScanReader:
         """Return one that knows both sensors."""
@@ -141,6 +145,7 @@ class Drop(Task):
     """Drop the returns of clean scans, such as a simulator's, that the model's sensor would not get."""
 
     verb: ClassVar[str] = "raydrop"
+    progress: ClassVar[str] = "dropping returns"
     kind: ClassVar[ConditionKind] = "surfaces"
     adds: ClassVar[bool] = False
 

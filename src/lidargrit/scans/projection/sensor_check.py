@@ -257,7 +257,7 @@ def _part_of_a_circle(scan: Scan) -> ScanError | None:
     return ScanError(
         f"returns in only {sectors * 360 // _SECTORS} of 360 degrees of azimuth in {scan.source}",
         "a full revolution",
-        "use the uncropped scan",
+        "use the uncropped scan, or have the rest filled in with: lidargrit complete SCAN OUT --observed returns",
     )
 
 
