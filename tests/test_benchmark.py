@@ -172,8 +172,10 @@ def test_a_budget_scales_all_stages_alike():
     vae = load_preset("lidarvae_small")
     short = with_budget(vae, sum(training_flops(vae).values()) / 4)
     assert short.model.warmup_scans == pytest.approx(vae.model.warmup_scans / 4, rel=0.01)
-    with pytest.raises(ConfigError, match="at least one batch"):
+    with pytest.raises(ConfigError, match="at least one batch") as refused:
         with_budget(preset, 1e6)
+    enough = with_budget(preset, float(refused.value.cure.removeprefix("raise it to ")))
+    assert all(fit.scans >= fit.batch_size for fit in enough.training.values())
     lacking = load_preset("r2flow_small")
     lacking = replace(lacking, model=replace(lacking.model, reflow=ReflowConfig()))
     for count in (training_flops, lambda preset: with_budget(preset, 1e13)):
@@ -188,7 +190,10 @@ def test_images_that_only_count_mark_surfaces_that_return():
 
 
 def test_stages_that_are_taken_from_another_run_are_not_counted():
-    preset = load_preset("lidargrit_compact_pixels", ["stages_from=pretrained", "train_anew=[pixels]"])
+    preset = load_preset(
+        "lidargrit_compact_pixels",
+        [f"training.{stage}.start=frozen:pretrained" for stage in ("tokenizer", "transformer")],
+    )
     flops = training_flops(preset)
     assert list(flops) == ["pixels"]
     scaled = with_budget(preset, flops["pixels"] / 4)

@@ -156,18 +156,18 @@ def test_every_preset_has_a_plan(preset, tmp_path, capsys, monkeypatch):
 
 def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, monkeypatch):
     words = ["train", "lidargrit_compact_pixels", str(tmp_path / "none"), "--dry-run"]
-    taking = ["--set", "stages_from=pretrained"]
-    assert main([*words, "--json", *taking, "train_anew=[pixels]"]) == 0
+    taking = ["--set", *(f"training.{stage}.start=frozen:pretrained" for stage in ("tokenizer", "transformer"))]
+    assert main([*words, "--json", *taking]) == 0
     stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
     assert {name for name, stage in stages.items() if not stage["taken_from"]} == {"pixels"}
     assert stages["transformer"]["taken_from"] == "pretrained"
     assert stages["transformer"]["flops"] == 0 < stages["pixels"]["flops"]
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
-    assert main([*words, *taking, "fine_tune=[pixels]"]) == 0
+    assert main([*words, *taking, "training.pixels.start=pretrained"]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
     assert "pixels: 1,019,023 parameters, 58,000 scans" in text
-    assert main([*words, *taking, "model.pixels.coarsest_cell=8"]) == 2
+    assert main([*words, *taking, "training.pixels.start=pretrained", "model.pixels.coarsest_cell=8"]) == 2
     assert "whose pixels is another (model.pixels.coarsest_cell=64)" in the_one_line(capsys.readouterr().err, "train")
 
 

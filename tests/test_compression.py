@@ -1,11 +1,7 @@
 """Range images come back from a compressed file to the last bit, or not at all."""
 
-import json
 import math
 import os
-import struct
-import zlib
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +10,15 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.core.errors import ConfigError, OutputError, ScanError
+from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.data.sources import open_source
+from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.inference.compress import rounding
-from lidargrit.inference.compress.archive import Archive, writing
+from lidargrit.inference.compress.archive import writing
 from lidargrit.inference.compress.arithmetic import exp, ln, sigmoid
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.nn.transformer import TransformerConfig
@@ -155,89 +153,6 @@ def test_one_that_does_not_reproduce_the_probabilities_says_so(codec, compressed
         codec.decompress(compressed[:7])
 
 
-def test_damaged_files_are_refused(tmp_path):
-    path, rng = tmp_path / "scans.lgz", np.random.default_rng(0)
-    with writing(path, {"step_mm": 20}) as writer:
-        for name in ("one", "two"):
-            writer.add(name, name, rng.bytes(300), 5)
-    whole = path.read_bytes()
-    archive = Archive(path)
-    archive.check()
-    assert archive.names == ["one", "two"]
-    damaged = [whole[:length] for length in range(0, len(whole), 7)] + [whole + b"\0", whole[1:]]
-    for bit in rng.choice(8 * len(whole), 500, replace=False):
-        altered = bytearray(whole)
-        altered[bit // 8] ^= 1 << (bit % 8)
-        damaged.append(bytes(altered))
-    for content in damaged:
-        path.write_bytes(content)
-        with pytest.raises(ScanError, match=r"cut off or altered|does not begin as a file of compressed scans"):
-            Archive(path).check()
-
-
-def archive_of(lines: list[list], header: bytes = b"{}", scans: bytes = b"") -> bytes:
-    """Return a file whose checksums hold, whatever its index says."""
-    index = zlib.compress(b"".join(json.dumps(line).encode() + b"\n" for line in lines))
-    start = struct.pack("<4sII", b"LGZ2", len(header), zlib.crc32(header)) + header + scans
-    return start + index + struct.pack("<QI4s", len(start), zlib.crc32(index), b"2ZGL")
-
-
-@pytest.mark.parametrize(
-    "lines",
-    [
-        [["a", 5, -1, 1]],
-        [["a", 5, 2**32, 1]],
-        [["a", 2**64, 0, 1]],
-        [["a", 2**64 - 1, 0, 1], ["b", 6, 0, 1]],  # together 5, as the scans, where sums have 64 bits
-        [["a", 2**63, 0, 1], ["b", 2**63 + 5, 0, 1]],
-    ],
-)
-def test_an_index_of_numbers_that_cannot_be_is_refused(tmp_path, lines):
-    path = tmp_path / "scans.lgz"
-    path.write_bytes(archive_of([["a", 5, zlib.crc32(b"hello"), 1]], scans=b"hello"))
-    assert Archive(path).read(0) == b"hello"
-    path.write_bytes(archive_of(lines, scans=b"hello"))
-    with pytest.raises(ScanError, match="cut off or altered"):
-        Archive(path).check()
-
-
-def test_an_index_into_a_file_without_scans_is_refused_in_words(tmp_path, capsys):
-    path = tmp_path / "scans.lgz"
-    path.write_bytes(archive_of([]))
-    assert main(["decompress", str(path), str(tmp_path / "out"), "--only", "0"]) == 2
-    assert f"no index: {path} holds no scans" in the_one_line(capsys.readouterr().err, "decompress")
-
-
-def test_an_interrupted_file_goes_on_and_ends_as_an_uninterrupted_one(tmp_path):
-    rng, names = np.random.default_rng(0), ["one", "bad", "two", "three"]
-    content = {name: b"" if name == "bad" else rng.bytes(200) for name in names}
-    begun, whole, unfinished = tmp_path / "scans.lgz", tmp_path / "whole.lgz", tmp_path / "scans.lgz.unfinished"
-    with writing(whole, {"step_mm": 20}) as writer:
-        for name in names:
-            writer.add(name, f"{name}, seed 4", content[name], 7)
-    with suppress(KeyboardInterrupt), writing(begun, {"step_mm": 20}) as writer:
-        for name in names[:3]:
-            writer.add(name, f"{name}, seed 4", content[name], 7)
-        raise KeyboardInterrupt
-    assert not begun.exists()
-    with (unfinished / "scans").open("r+b") as file:  # as after a loss of power: the last scan is not there as a whole
-        file.truncate((unfinished / "scans").stat().st_size - 10)
-    with pytest.raises(OutputError, match="scans of another model, step or version"), writing(begun, {"step_mm": 2}):
-        pass
-    with (
-        pytest.raises(OutputError, match="the scan one, which is not the next of these"),
-        writing(begun, {"step_mm": 20}) as writer,
-    ):
-        writer.go_on(iter(["one, seed 3"]))
-    with writing(begun, {"step_mm": 20}) as writer:
-        assert writer.go_on(f"{name}, seed 4" for name in names) == 2
-        for name in names[2:]:
-            writer.add(name, f"{name}, seed 4", content[name], 7)
-    assert begun.read_bytes() == whole.read_bytes()
-    assert Archive(begun).names == ["one", "two", "three"]
-    assert not unfinished.exists()
-
-
 def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("lidargrit.inference.compress.command._codec_of", lambda *_: ScanCodec(made(), 20))
     path = tmp_path / "scans.lgz"
@@ -283,6 +198,7 @@ def test_the_commands_restore_what_was_compressed(tmp_path, capsys):
     assert main(["decompress", file, out, "--model", run, "--only", "1"]) == 0
     assert [one.name for one in Path(out).iterdir() if one.suffix == ".npy"] == ["1.npy"]
     assert main(["decompress", file, out, "--model", run]) == 0
+    assert open_source(out).sensor.same_rays(load(run).sensor)
     for index, range_m in enumerate(scans(2).range_m):
         assert np.abs(np.load(Path(out) / f"{index}.npy") - range_m.numpy()).max() <= 0.01 + 1e-6
     capsys.readouterr()
@@ -335,7 +251,7 @@ def test_a_first_scan_that_is_not_restored_leaves_the_folder_to_a_corrected_comm
         with pytest.raises(AttributeError):
             main(["decompress", "scans.lgz", "out", "--model", "run"])
     assert main(["decompress", "scans.lgz", "out", "--model", "run", "--format", "pcd"]) == 0
-    assert sorted(os.listdir("out")) == ["0.pcd", "decompressed.json"]
+    assert sorted(os.listdir("out")) == ["0.pcd", "decompressed.json", "sensor.json"]
 
 
 def test_an_interrupted_file_goes_on_only_with_the_options_that_say_which_scans(two_sources, capsys, monkeypatch):
@@ -362,19 +278,6 @@ def test_an_interrupted_file_goes_on_only_with_the_options_that_say_which_scans(
     assert compress("a", "whole.lgz") == 0
     assert Path("scans.lgz").read_bytes() == Path("whole.lgz").read_bytes()
     assert not Path("scans.lgz.unfinished").exists()
-
-
-def test_one_that_may_have_left_scans_out_does_not_go_on_as_one_that_refuses_them(tmp_path):
-    path = tmp_path / "scans.lgz"
-    for begun, then in (("skip", "refuse"), ("refuse", "skip")):
-        with suppress(KeyboardInterrupt), writing(path, {}, {"bad_scans": begun}) as writer:
-            writer.add("one", "one", b"one", 1)
-            raise KeyboardInterrupt
-        if begun == "skip":
-            with pytest.raises(OutputError, match=r"scans of other options \(bad_scans\)"):
-                writing(path, {}, {"bad_scans": then}).__enter__()
-        with writing(path, {}, {"bad_scans": "skip"}) as writer:
-            assert writer.go_on(iter(["one"])) == 1
 
 
 def test_the_formats_that_are_named_are_those_it_writes(tmp_path, two_sources, capsys):

@@ -33,4 +33,5 @@ def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):
     preset, _, said = chosen(data=str(tmp_path / "tree" / "sequences" / "00"))
     assert "WARNING: the last scans are held out" in said
     assert preset.data.val[0].endswith("[85%:]")
-    assert preset.fine_tune == ("tokenizer", "transformer", "pixels")
+    assert preset.start_runs == dict.fromkeys(("tokenizer", "transformer", "pixels"), "pretrained")
+    assert not preset.frozen

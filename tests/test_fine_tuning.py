@@ -71,7 +71,8 @@ def test_the_verb_tells_the_time_trains_all_stages(scans, tmp_path, capsys):
             before.objective(stage).state_dict().values(), after.objective(stage).state_dict().values(), strict=True
         )
         assert any(not torch.equal(old, new) for old, new in pairs), f"{stage} was trained"
-    assert json.loads((out / "run.json").read_text())["preset"]["fine_tune"] == ["tokenizer", "transformer", "pixels"]
+    training = json.loads((out / "run.json").read_text())["preset"]["training"]
+    assert {stage: config["start"] for stage, config in training.items()} == dict.fromkeys(after.stages, "pretrained")
 
 
 def test_too_few_scans_are_refused_in_one_line(tmp_path, capsys):

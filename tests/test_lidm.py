@@ -13,7 +13,7 @@ from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.encoding_cache import EncodingCache
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.settings import Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.curve_vqvae import (
     CurveVqvae,
     CurveVqvaeConfig,
@@ -299,7 +299,8 @@ def test_the_tokenizer_of_a_lidargrit_is_taken_as_it_is(tmp_path):
     theirs = LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR)
     theirs.save(tmp_path)
     model = LidmConfig(theirs.config.tokenizer, LatentUnetConfig(32, (1,), 1, ()), scale_latents=True)
-    preset, generator = Preset("shared", "lidm", model, DataConfig(), {}, tokenizer_from=str(tmp_path)), made(model)
+    fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-3, start=f"frozen:{tmp_path}")
+    preset, generator = Preset("shared", "lidm", model, DataConfig(), {"tokenizer": fit}), made(model)
     taken = taken_stages(preset, generator)
     assert taken.keys() == {"tokenizer"}
     generator.load_stage("tokenizer", taken["tokenizer"])

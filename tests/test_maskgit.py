@@ -182,7 +182,9 @@ def test_a_tokenizer_is_taken_from_another_run(tmp_path):
     settings = [*MODEL, *SIMULATED, *SHORT]
     donor = train(load_preset("lidargrit_demo", settings), tmp_path / "donor")
     other_scans = "data.train=[simulated:6:train]"
-    preset = load_preset("maskgit_demo", [*settings, other_scans, f"tokenizer_from={tmp_path / 'donor'}"])
+    preset = load_preset(
+        "maskgit_demo", [*settings, other_scans, f"training.tokenizer.start=frozen:{tmp_path / 'donor'}"]
+    )
     generator = train(preset, tmp_path / "run")
     theirs, ours = donor.get_tokenizer().state_dict(), generator.get_tokenizer().state_dict()
     assert theirs.keys() == ours.keys()

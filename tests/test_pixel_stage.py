@@ -64,7 +64,7 @@ def scans(count: int) -> RangeImage:
     return RangeImage.masked(2 + 40 * torch.rand(size, generator=rng), torch.rand(size, generator=rng) < 0.8, SENSOR)
 
 
-def preset_of(pixels: PixelDecoderConfig | None, stages_from: str | None = None) -> Preset:
+def preset_of(pixels: PixelDecoderConfig | None) -> Preset:
     fit = TrainingConfig(scans=4, batch_size=2, learning_rate=1e-3, validation_scans=1)
     stages = ("tokenizer", "transformer") if pixels is None else ("tokenizer", "transformer", "pixels")
     return Preset(
@@ -73,7 +73,6 @@ def preset_of(pixels: PixelDecoderConfig | None, stages_from: str | None = None)
         LidarGritConfig(TOKENIZER, TRANSFORMER, pixels),
         DataConfig(train=("simulated:4:train",), val=("simulated:1:val",), columns=512, column_stride=8),
         dict.fromkeys(stages, fit),
-        stages_from=stages_from,
     )
 
 

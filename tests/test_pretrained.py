@@ -168,12 +168,14 @@ def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsy
     assert main(["view", "pretrained", "-n", "1", "-o", "page.html"]) == 0
     few = ["--reference", "simulated:2:test", "-n", "2", "--metrics", "bev_jsd"]
     assert main(["compare", "table", "pretrained", *few]) == 0
-    words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "tokenizer_from=pretrained"]
+    words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "training.tokenizer.start=frozen:pretrained"]
     words += [f"training.transformer.{setting}" for setting in ("scans=2", "batch_size=2", "warmup_scans=0")]
     words.append("model.transformer.layers=1")
     assert main(["train", "lidargrit_compact", "run", "--set", *words]) == 0
     assert main(["publish", "run", "to_share"]) == 0
-    assert json.loads((tmp_path / "to_share" / "run.json").read_text())["preset"]["tokenizer_from"] is None
+    assert (
+        json.loads((tmp_path / "to_share" / "run.json").read_text())["preset"]["training"]["tokenizer"]["start"] == ""
+    )
     known = [
         json.loads((run_folder / "trained_on.json").read_text())["fingerprints"] for run_folder in (FOLDER, Path("run"))
     ]

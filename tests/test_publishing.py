@@ -286,11 +286,15 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
     fit = {"scans": 8, "batch_size": 2, "learning_rate": 0.1}
     imported = {"files": [{"name": "vq.pth", "sha256": "ab" * 32}]}
     write_json(tmp_path / "first" / "run.json", {"preset": {**data, "training": {"tokenizer": fit}}, **imported})
-    preset = replace(load_preset("lidargrit_demo"), tokenizer_from=str(tmp_path / "first"))
-    about = {"preset": configuration.to_json(preset), "taken": taken_facts(preset, {"tokenizer": "first"})}
+    preset = load_preset("lidargrit_demo", [f"training.tokenizer.start=frozen:{tmp_path / 'first'}"])
+    about = {"preset": configuration.to_json(preset), "taken": taken_facts(preset)}
     write_json(tmp_path / "second" / "run.json", about)
-    again = replace(preset, tokenizer_from=None, stages_from=str(tmp_path / "second"), fine_tune=("transformer",))
-    taken = taken_facts(again, {"tokenizer": "second"})
+    starts = [
+        f"training.tokenizer.start=frozen:{tmp_path / 'second'}",
+        f"training.transformer.start={tmp_path / 'second'}",
+    ]
+    again = load_preset("lidargrit_demo", starts)
+    taken = taken_facts(again)
     assert taken["training"] == {"tokenizer": None}, "no run of ours trained it"
     head, body = head_of(model_card(marginal(), {"preset": configuration.to_json(again), "taken": taken}, Provenance()))
     assert head["license"] == "cc-by-nc-sa-3.0"
@@ -301,7 +305,7 @@ def test_terms_of_weights_that_were_taken_over_stay(tmp_path):
 
 
 def test_a_run_that_took_stages_of_an_unknown_training_claims_no_free_terms(tmp_path):
-    over = taken_facts(replace(load_preset("lidargrit_demo"), stages_from=str(tmp_path)), {"tokenizer": "it"})
+    over = taken_facts(load_preset("lidargrit_demo", [f"training.tokenizer.start=frozen:{tmp_path}"]))
     assert head_of(model_card(marginal(), {"preset": {}, "taken": over}, Provenance()))[0]["license"] == "other"
 
 

@@ -196,9 +196,11 @@ def test_a_distilled_model_takes_the_steps_that_it_has_learned():
 def test_a_trained_flow_is_taken_over_if_its_sizes_fit(tmp_path):
     sizes = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
     load_preset("r2flow_small", sizes).build_generator().save(tmp_path)
-    preset = load_preset("r2flow_small_reflow", (*sizes, f"stages_from={tmp_path}"))
+    preset = load_preset("r2flow_small_reflow", (*sizes, f"training.flow.start=frozen:{tmp_path}"))
     assert taken_stages(preset, preset.build_generator()).keys() == {"flow"}
-    wider = load_preset("r2flow_small_reflow", (*sizes, "model.hdit.channels=32", f"stages_from={tmp_path}"))
+    wider = load_preset(
+        "r2flow_small_reflow", (*sizes, "model.hdit.channels=32", f"training.flow.start=frozen:{tmp_path}")
+    )
     with pytest.raises(ConfigError, match=r"whose flow is another \(model\.hdit\.channels=\d+\); wanted "):
         taken_stages(wider, wider.build_generator())
 

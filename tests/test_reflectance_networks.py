@@ -14,7 +14,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load
 from lidargrit.generation.objective import hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
-from lidargrit.generation.settings import Preset
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.fills import FILLS, fill, fill_lacking
@@ -302,20 +302,20 @@ def test_what_a_generator_does_not_write_is_filled_in_from_observed_returns(fold
 
 
 def test_a_stage_may_start_from_weights_that_lack_it_but_not_lose_it(folders):
-    def preset(run: str, model: Completion | Raydrop, *fine_tune: str) -> Preset:
+    def preset(run: str, model: Completion | Raydrop, frozen: str = "") -> Preset:
         name = model.public_name()
-        settings = {"stages_from": str(folders / run / name), "fine_tune": fine_tune}
-        return Preset("grown", name, model.config, DataConfig(), {}, **settings)
+        fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-3, start=f"{frozen}{folders / run / name}")
+        return Preset("grown", name, model.config, DataConfig(), {name: fit})
 
     grown = Raydrop(RaydropConfig(replace(RAYDROP, labels=True)), SENSOR)
-    taken = taken_stages(preset("plain", grown, "raydrop"), grown)["raydrop"]
+    taken = taken_stages(preset("plain", grown), grown)["raydrop"]
     assert taken.state_dict().keys() < grown.objective("raydrop").state_dict().keys()
     other = Completion(CompletionConfig(replace(NETWORK, reflectance=True)), SENSOR)
     with pytest.raises(ConfigError, match=r"whose completion is another \(model\.completion\.labels=True\)"):
-        taken_stages(preset("plain", other), other)  # the stage is not fine-tuned
+        taken_stages(preset("plain", other, "frozen:"), other)  # the stage is not fine-tuned
     less = Raydrop(RaydropConfig(replace(RAYDROP, reflectance=False)), SENSOR)
     with pytest.raises(ConfigError, match=r"whose raydrop is another \(model\.raydrop\.reflectance=True\)"):
-        taken_stages(preset("run", less, "raydrop"), less)
+        taken_stages(preset("run", less), less)
 
 
 def test_a_wrong_setting_is_refused_in_one_line(tmp_path, capsys):

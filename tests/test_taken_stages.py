@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from lidargrit.core.configuration import changed, override
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors
 from lidargrit.data.prepared.config import DataConfig
@@ -18,10 +19,22 @@ from lidargrit.training.plan import check_stages
 from lidargrit.training.taken_stages import taken_stages
 from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, preset_of
 
+ALL = ("tokenizer", "transformer", "pixels")
+
+
+def starting(preset: Preset, run: object, frozen: tuple[str, ...] = (), further: tuple[str, ...] = ()) -> Preset:
+    """Return a preset whose named stages start from a run, and whose others are new."""
+    starts = {
+        **dict.fromkeys(preset.training, ""),
+        **dict.fromkeys(frozen, f"frozen:{run}"),
+        **dict.fromkeys(further, str(run)),
+    }
+    return changed(preset, {f"training.{stage}.start": start for stage, start in starts.items()})
+
 
 def test_only_the_pixel_decoder_is_trained_over_a_finished_run(tmp_path):
     first = train(preset_of(None), tmp_path / "first")
-    second = train(preset_of(PIXELS, stages_from=str(tmp_path / "first")), tmp_path / "second")
+    second = train(starting(preset_of(PIXELS), tmp_path / "first", ALL[:2]), tmp_path / "second")
     assert not (tmp_path / "second" / "tokenizer").exists()
     assert not (tmp_path / "second" / "transformer").exists()
     for name, weight in first.state_dict().items():
@@ -33,8 +46,8 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
     donor = made()
     donor.save(tmp_path / "donor")
     fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-6, validation_scans=1)
-    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    preset = replace(preset, training=dict.fromkeys(preset.training, fit), fine_tune=("pixels",))
+    preset = replace(preset_of(PIXELS), training=dict.fromkeys(ALL, fit))
+    preset = starting(preset, tmp_path / "donor", frozen=ALL[:2], further=("pixels",))
     tuned = train(preset, tmp_path / "run").state_dict()
     assert not (tmp_path / "run" / "transformer").exists()
     for stage in ("tokenizer", "transformer", "pixels"):
@@ -45,63 +58,69 @@ def test_fine_tuning_starts_from_the_weights_of_the_other_run(tmp_path):
         ]
         assert max(moved) < 1e-4, "the weights are those of the donor, but for a step of the learning rate"
         assert (max(moved) > 0) == (stage == "pixels")
-    for settings, message in (
-        ({"fine_tune": ("mask",)}, "fine_tune=mask; wanted one of tokenizer, transformer, pixels"),
-        (
-            {"fine_tune": ("pixels",), "train_anew": ("pixels",)},
-            "pixels in fine_tune and in train_anew; wanted a stage",
-        ),
-    ):
-        wrong = replace(preset, **settings)
+    with pytest.raises(ConfigError, match=r"the setting 'training\.mask\.start'"):
+        override(preset, ["training.mask.start=pretrained"])
+    with pytest.raises(ConfigError, match="start=frozen:; wanted frozen:RUN"):
+        override(preset, ["training.pixels.start=frozen:"])
+
+
+@pytest.mark.parametrize("further", [False, True])
+def test_a_stage_over_a_tokenizer_that_is_trained_again_is_refused(tmp_path, further):
+    made().save(tmp_path / "donor")
+    preset, run = preset_of(PIXELS), tmp_path / "donor"
+
+    def trained(*names: str) -> Preset:
+        others = tuple(stage for stage in ALL if stage not in names)
+        return starting(preset, run, others, names if further else ())
+
+    for names in (("tokenizer",), ("tokenizer", "pixels")):
+        wrong = trained(*names)
+        message = r"training\.transformer\.start=frozen:\S+ without training\.tokenizer\.start=frozen:"
         with pytest.raises(ConfigError, match=message):
             taken_stages(wrong, wrong.build_generator())
-    with pytest.raises(ConfigError, match="fine_tune=pixels without stages_from"):
-        replace(preset, stages_from=None)
-    with pytest.raises(ConfigError, match="train_anew=pixels without stages_from"):
-        replace(preset, stages_from=None, fine_tune=(), train_anew=("pixels",))
+    with pytest.raises(ConfigError, match=r"training\.pixels\.start=frozen:\S+ without training\.tokenizer\.start"):
+        check_stages(trained("tokenizer", "transformer"))
+    right = trained(*ALL)
+    assert set(taken_stages(right, right.build_generator())) == ({*ALL} if further else set())
 
 
-@pytest.mark.parametrize("setting", ["train_anew", "fine_tune"])
-def test_a_stage_over_a_tokenizer_that_is_trained_again_is_refused(tmp_path, setting):
-    made().save(tmp_path / "donor")
-    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    for names in (("tokenizer",), ("tokenizer", "pixels")):
-        wrong = replace(preset, **{setting: names})
-        with pytest.raises(ConfigError, match=f"{setting}=tokenizer without transformer, which learned from the token"):
-            taken_stages(wrong, wrong.build_generator())
-    with pytest.raises(ConfigError, match=f"{setting}=tokenizer without pixels"):
-        check_stages(replace(preset, **{setting: ("tokenizer", "transformer")}))
-    right = replace(preset, **{setting: ("tokenizer", "transformer", "pixels")})
-    assert set(taken_stages(right, right.build_generator())) == ({*right.fine_tune})
+def test_stages_are_taken_from_several_runs_unless_one_rests_on_another(tmp_path):
+    for name in ("first", "second"):
+        made().save(tmp_path / name)
+    preset = starting(preset_of(PIXELS), tmp_path / "first", frozen=("tokenizer",))
+    second = tmp_path / "second"
+    further = changed(preset, {"training.transformer.start": str(second)})
+    assert taken_stages(further, further.build_generator()).keys() == {"tokenizer", "transformer"}
+    over = changed(preset, {"training.transformer.start": f"frozen:{second}"})
+    with pytest.raises(ConfigError, match="the transformer learned from that tokenizer"):
+        taken_stages(over, over.build_generator())
 
 
 def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
     made(None).save(tmp_path / "donor")
-    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
-    fits = {"tokenizer": preset.training["tokenizer"], "pixels": replace(preset.training["pixels"], batch_size=6)}
-    preset = replace(preset, training=fits)  # a batch of 2 that 3 processes cannot share, and no transformer's settings
+    preset = changed(preset_of(PIXELS), {"training.pixels.batch_size": 6})  # 3 processes cannot share a batch of 2
+    preset = starting(preset, tmp_path / "donor", ("tokenizer", "transformer"))
     checked = check_stages(preset, processes=3)
-    assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "donor"))
+    assert checked.frozen == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "donor"))
     assert list(checked.objectives) == ["tokenizer", "transformer", "pixels"]
     assert [stage.scans for stage in plan_training(preset).stages] == [0, 0, 4]
-    for settings, message in (
-        ({"train_anew": ("tokenizer", "transformer")}, "batch_size=2 on 3 processes"),
-        ({"fine_tune": ("transformer",)}, r"without training\.transformer"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            check_stages(replace(preset, **settings), processes=3)
+    with pytest.raises(ConfigError, match="batch_size=2 on 3 processes"):
+        check_stages(starting(preset, tmp_path / "donor"), processes=3)
+    without = {stage: config for stage, config in preset.training.items() if stage != "transformer"}
+    with pytest.raises(ConfigError, match=r"without training\.transformer"):
+        check_stages(replace(preset, training=without), processes=3)
 
 
 def test_a_stage_that_was_trained_with_another_dropout_is_taken(tmp_path):
     """The page about training gives this command."""
     load_preset("lidargrit_compact").build_generator().save(tmp_path / "compact")
-    checked = check_stages(load_preset("lidargrit_compact_pixels", [f"stages_from={tmp_path / 'compact'}"]))
-    assert checked.donors == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "compact"))
+    checked = check_stages(starting(load_preset("lidargrit_compact_pixels"), tmp_path / "compact", ALL[:2]))
+    assert checked.frozen == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "compact"))
 
 
 def test_a_stage_that_does_not_fit_is_told_before_any_scan(tmp_path):
     made(None).save(tmp_path / "donor")
-    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    preset = starting(preset_of(PIXELS), tmp_path / "donor", ALL[:2])
     wider = replace(preset.model, transformer=replace(TRANSFORMER, width=32))
     preset = replace(preset, model=wider, data=replace(preset.data, train=("nowhere",)))
     with pytest.raises(ConfigError, match="whose transformer is another"):
@@ -125,12 +144,12 @@ def test_rays_of_another_sensor_are_not_taken_over(kind):
 
 def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
     made().save(tmp_path / "donor")
-    preset = preset_of(PIXELS, stages_from=str(tmp_path / "donor"))
+    preset = starting(preset_of(PIXELS), tmp_path / "donor", ALL)
     wide = replace(preset, data=replace(preset.data, columns=512, column_stride=4))
     wide = replace(wide, model=replace(wide.model, transformer=replace(TRANSFORMER, residual_dropout=0.0)))
     with pytest.raises(ConfigError, match="whose tokenizer is another"):
         taken_stages(wide, wide.build_generator())
-    wide = replace(wide, fine_tune=("tokenizer", "transformer", "pixels"))
+    wide = starting(wide, tmp_path / "donor", further=ALL)
     generator = wide.build_generator()
     objective = generator.objective("transformer")
     weights = objective.weights_from(taken_stages(wide, generator)["transformer"])
@@ -142,11 +161,11 @@ def test_fine_tuning_takes_a_run_of_fewer_columns_and_another_dropout(tmp_path):
     assert torch.allclose(fine[:, :, 2], 0.75 * coarse[:, :, 1] + 0.25 * coarse[:, :, 0])
 
 
-@pytest.mark.parametrize("fine_tune", [(), ("tokenizer", "transformer", "pixels")])
-def test_settings_of_sampling_alone_are_the_preset_s_own(fine_tune, tmp_path):
+@pytest.mark.parametrize("kind", ["frozen", "further"])
+def test_settings_of_sampling_alone_are_the_preset_s_own(kind, tmp_path):
     made().save(tmp_path / "donor")
-    preset = preset_of(replace(PIXELS, range_temperature=0.1), stages_from=str(tmp_path / "donor"))
-    preset = replace(preset, fine_tune=fine_tune, model=replace(preset.model, guidance=1.5))
+    preset = starting(preset_of(replace(PIXELS, range_temperature=0.1)), tmp_path / "donor", **{kind: ALL})
+    preset = replace(preset, model=replace(preset.model, guidance=1.5))
     generator = preset.build_generator()
     assert {"transformer", "pixels"} <= set(taken_stages(preset, generator))
     assert (generator.pixels.config.range_temperature, generator.config.guidance) == (0.1, 1.5)
@@ -154,36 +173,35 @@ def test_settings_of_sampling_alone_are_the_preset_s_own(fine_tune, tmp_path):
 
 def test_a_run_of_other_sizes_or_another_kind_gives_no_stages(tmp_path):
     train(preset_of(None), tmp_path / "first")
-    preset = preset_of(PIXELS, stages_from=str(tmp_path / "first"))
+    preset = starting(preset_of(PIXELS), tmp_path / "first", ALL[:2])
     wider = replace(preset, model=replace(preset.model, transformer=replace(TRANSFORMER, width=32)))
     with pytest.raises(ConfigError, match=r"whose transformer is another \(model.transformer.width=16\)"):
         train(wider, tmp_path / "second")
     other = replace(preset, generator="maskgit", model=MaskGitConfig(TOKENIZER, TRANSFORMER, PIXELS))
     with pytest.raises(ConfigError, match="a run of the generator 'lidargrit'"):
         train(other, tmp_path / "third")
-    anew = replace(preset, train_anew=("transformer",))
+    anew = starting(preset, tmp_path / "first", ("tokenizer",))
     assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
-    unknown = replace(preset, train_anew=("mask",))
-    with pytest.raises(ConfigError, match="train_anew=mask; wanted one of tokenizer, transformer, pixels"):
-        taken_stages(unknown, unknown.build_generator())
-    with pytest.raises(ConfigError, match="tokenizer_from and stages_from together"):
-        replace(preset, tokenizer_from="pretrained")
+    lacking = starting(preset, tmp_path / "first", ALL)
+    with pytest.raises(ConfigError, match="wanted a run of 'lidargrit', or of another with the same stage 'pixels'"):
+        check_stages(lacking)
 
 
 def test_a_stage_whose_settings_do_not_have_its_name_is_compared_by_all_of_them(tmp_path):
     small = ("model.unet.channel_multipliers=[1,1,1,1]", "data.column_stride=1", "data.columns=64")
     donor = load_preset("r2dm_small", small).build_generator()
     donor.save(tmp_path)
-    preset = load_preset("r2dm_small", (*small, f"stages_from={tmp_path}"))
+    start = f"training.diffusion.start=frozen:{tmp_path}"
+    preset = load_preset("r2dm_small", (*small, start))
     assert taken_stages(preset, preset.build_generator()).keys() == {"diffusion"}
-    other = load_preset("r2dm_small", (*small, "model.unet.norm_groups=2", f"stages_from={tmp_path}"))
+    other = load_preset("r2dm_small", (*small, "model.unet.norm_groups=2", start))
     with pytest.raises(ConfigError, match=r"whose diffusion is another \(model\.unet\.norm_groups="):
         taken_stages(other, other.build_generator())
-    columns = (small[0], "data.column_stride=2", "data.columns=128", f"stages_from={tmp_path}")
-    taken = load_preset("r2dm_small", columns)
+    columns = (small[0], "data.column_stride=2", "data.columns=128")
+    taken = load_preset("r2dm_small", (*columns, start))
     with pytest.raises(ConfigError, match=r"whose diffusion is another \(data\.sensor\)"):
         taken_stages(taken, taken.build_generator())
-    tuned = load_preset("r2dm_small", (*columns, "fine_tune=[diffusion]"))
+    tuned = load_preset("r2dm_small", (*columns, f"training.diffusion.start={tmp_path}"))
     assert taken_stages(tuned, tuned.build_generator()).keys() == {"diffusion"}
 
 
@@ -201,14 +219,14 @@ def test_a_denoiser_is_compared_by_the_noise_and_the_latents_that_it_learned(tmp
     small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
     donor = load_preset("lidm_small", small).build_generator()
     donor.save(tmp_path)
-    changed = [*small, f"model.{setting}", f"stages_from={tmp_path}"]
-    changed += ["model.scale_latents=false"] if "axes" in setting else []
-    for further in ("fine_tune=[]", "fine_tune=[denoiser]"):
-        other = load_preset("lidm_small", (*changed, further))
+    words = [*small, f"model.{setting}", f"training.tokenizer.start=frozen:{tmp_path}"]
+    words += ["model.scale_latents=false"] if "axes" in setting else []
+    for frozen in ("frozen:", ""):
+        other = load_preset("lidm_small", (*words, f"training.denoiser.start={frozen}{tmp_path}"))
         name = "scale_latents" if "axes" in setting else setting.partition("=")[0]
         with pytest.raises(ConfigError, match=rf"denoiser is another \(model\.{name}=.*one of this preset's model "):
             taken_stages(other, other.build_generator())
-    anew = load_preset("lidm_small", (*changed, "train_anew=[denoiser]"))
+    anew = load_preset("lidm_small", words)
     assert taken_stages(anew, anew.build_generator()).keys() == {"tokenizer"}
 
 
@@ -239,22 +257,21 @@ def test_a_gan_that_is_trained_further_keeps_its_discriminator(tmp_path):
     model = load_class("dusty").smallest_config(SENSOR)
     preset = Preset("a test", "dusty", model, data, {"adversarial": fit})
     train(preset, tmp_path / "gan")
-    tuned = replace(preset, stages_from=str(tmp_path / "gan"), fine_tune=("adversarial",))
+    tuned = starting(preset, tmp_path / "gan", further=("adversarial",))
     taken = taken_stages(tuned, tuned.build_generator())["adversarial"].state_dict()
     saved, _ = read_tensors(tmp_path / "gan" / "adversarial" / "checkpoint.safetensors")
     of_discriminator = [name for name in taken if name.startswith("discriminator")]
     assert of_discriminator
     assert all(torch.equal(taken[name], saved[f"average.{name}"]) for name in taken)
     (tmp_path / "gan" / "adversarial" / "checkpoint.safetensors").unlink()
-    with pytest.raises(ConfigError, match=r"fine_tune=adversarial without .*trained discriminator"):
+    with pytest.raises(ConfigError, match=r"training\.adversarial\.start=\S+ without .*trained discriminator"):
         check_stages(tuned)
-    assert not check_stages(replace(tuned, fine_tune=(), train_anew=("adversarial",))).donors
+    assert not check_stages(preset).frozen
 
 
 def test_a_stage_whose_sizes_another_stage_decides_is_refused_before_any_training(tmp_path):
     made().save(tmp_path)
-    preset = preset_of(None, stages_from=str(tmp_path))
-    preset = replace(preset, train_anew=("tokenizer",), fine_tune=("transformer",))
+    preset = starting(preset_of(None), tmp_path, further=("transformer",))
     check_stages(preset)
     other = replace(preset.model, tokenizer=replace(TOKENIZER, num_codes=TOKENIZER.num_codes // 2))
     with pytest.raises(ConfigError, match=r"whose transformer is another \(\S+ of \d+"):
@@ -264,26 +281,25 @@ def test_a_stage_whose_sizes_another_stage_decides_is_refused_before_any_trainin
 def test_plans_of_a_denoiser_that_is_trained_further_need_no_values(tmp_path):
     small = ("model.tokenizer.channels=32", "model.denoiser.channels=32", "model.tokenizer.num_codes=16")
     load_preset("lidm_small", small).build_generator().save(tmp_path)
-    tuned = load_preset("lidm_small", (*small, f"stages_from={tmp_path}", "fine_tune=[denoiser]"))
-    assert check_stages(tuned).donors.keys() == {"tokenizer"}
+    starts = (f"training.tokenizer.start=frozen:{tmp_path}", f"training.denoiser.start={tmp_path}")
+    tuned = load_preset("lidm_small", (*small, *starts))
+    assert check_stages(tuned).frozen.keys() == {"tokenizer"}
 
 
 def test_one_reflow_is_distilled_to_several_numbers_of_steps(tmp_path):
     small = ("model.hdit.depths=[1,1]", "model.hdit.heads=[1,2]")
     load_preset("r2flow_small_reflow", (*small, "model.reflow.distilled_steps=4")).build_generator().save(tmp_path)
-    taken = (*small, f"stages_from={tmp_path}", "model.reflow.distilled_steps=2")
-    preset = load_preset("r2flow_small_reflow", (*taken, "train_anew=[distillation]"))
-    assert check_stages(preset).donors.keys() == {"flow", "reflow"}
+    start = [f"training.{stage}.start=frozen:{tmp_path}" for stage in ("flow", "reflow", "distillation")]
+    taken = (*small, *start, "model.reflow.distilled_steps=2")
+    preset = load_preset("r2flow_small_reflow", (*taken, "training.distillation.start="))
+    assert check_stages(preset).frozen.keys() == {"flow", "reflow"}
     with pytest.raises(ConfigError, match=r"whose distillation is another \(model\.reflow\.distilled_steps=4\)"):
         check_stages(load_preset("r2flow_small_reflow", taken))
 
 
 def test_runs_that_are_no_donors(tmp_path):
     made().save(tmp_path)
-    with pytest.raises(ConfigError, match="for 'multiscale', which has no tokenizer"):
-        check_stages(load_preset("multiscale_small", (f"tokenizer_from={tmp_path}",)))
-    with pytest.raises(ConfigError, match=r"a run of 'r2dm'; choose another run$"):
-        check_stages(load_preset("r2dm_small", (f"stages_from={tmp_path}",)))
-    nothing = load_preset("lidargrit_small", ("stages_from=", "tokenizer_from="))
-    assert nothing.stages_from is None
-    assert nothing.tokenizer_from is None
+    with pytest.raises(ConfigError, match="a run of 'r2dm', or of another with the same stage 'diffusion'; choose"):
+        check_stages(load_preset("r2dm_small", (f"training.diffusion.start={tmp_path}",)))
+    nothing = load_preset("lidargrit_small", ("training.tokenizer.start=",))
+    assert nothing.start_runs == nothing.frozen == {}

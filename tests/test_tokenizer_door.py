@@ -3,13 +3,13 @@
 import io
 import json
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
 
 from lidargrit.cli import main
 from lidargrit.core import configuration
+from lidargrit.core.configuration import changed
 from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load, load_class
@@ -77,11 +77,15 @@ def test_a_second_tokenizer_trains_samples_and_is_scored_and_served(generator, t
 
 def test_a_trained_tokenizer_is_taken_by_another_run_of_its_kind(tmp_path, monkeypatch):
     toy = installed(monkeypatch)
+
+    def taking(preset: Preset) -> Preset:
+        return changed(preset, {"training.tokenizer.start": f"frozen:{tmp_path / 'first'}"})
+
     first = train(preset_of("lidargrit", toy()), tmp_path / "first")
-    second = train(replace(preset_of("maskgit", toy()), tokenizer_from=str(tmp_path / "first")), tmp_path / "second")
+    second = train(taking(preset_of("maskgit", toy())), tmp_path / "second")
     theirs, ours = first.get_tokenizer().state_dict(), second.get_tokenizer().state_dict()
     assert all(torch.equal(weight, ours[name]) for name, weight in theirs.items())
-    other = replace(preset_of("maskgit", VqvaeConfig()), tokenizer_from=str(tmp_path / "first"))
+    other = taking(preset_of("maskgit", VqvaeConfig()))
     with pytest.raises(ConfigError, match=rf"whose tokenizer is another \(model\.tokenizer\.name={NAME}\)"):
         train(other, tmp_path / "third")
 

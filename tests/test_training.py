@@ -384,9 +384,8 @@ def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
 
 
 def test_a_run_to_take_stages_from_is_looked_at_before_any_scan(tmp_path):
-    preset = load_preset(
-        "lidargrit_demo", ("data.train=nowhere", "data.val=nowhere", f"stages_from={tmp_path / 'nothing'}")
-    )
+    start = f"training.tokenizer.start={tmp_path / 'nothing'}"
+    preset = load_preset("lidargrit_demo", ("data.train=nowhere", "data.val=nowhere", start))
     with pytest.raises(CheckpointError, match="nothing, which does not exist"):
         train(preset, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -133,20 +133,16 @@ def preset(
     *,
     seed: int = 0,
     published: str = "",
-    stages_from: str | None = None,
-    fine_tune: tuple[str, ...] = (),
     **training: TrainingConfig,
 ) -> Preset:
     """Return a preset of the system whose configuration the model is.
 
     Args:
         published: scores that a paper reports.
-        stages_from: run whose stages are taken.
-        fine_tune: names of stages that are trained further.
         training: settings of the training of each stage.
     """
     generator = type(model).__module__.split(".")[-2]  # the folder of the system, systems/NAME/system.py
-    return Preset(title, generator, model, data, training, seed, published, None, stages_from, fine_tune=fine_tune)
+    return Preset(title, generator, model, data, training, seed, published)
 
 
 def variant(title: str, base: Preset, settings: Mapping[str, Any]) -> Preset:

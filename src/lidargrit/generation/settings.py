@@ -12,6 +12,7 @@ from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.augmentation import Augmentation
 from lidargrit.scans.sensors import SensorModel
 
+_FROZEN = "frozen:"
 _BATCH_AT_MOST = 65_536  # scans: 4 GB of the smallest images, and more than any step learns from
 
 
@@ -50,6 +51,8 @@ class TrainingConfig(Settings):
         validation_scans: largest number of scans in a validation, evenly spaced over the validation set.
         checkpoint_every: number of scans between two checkpoints.
         pictures_every: number of scans between two pictures of reconstructed or sampled scans; 0 for none.
+        start: finished run with the stage, whose weights are trained further; ``frozen:RUN`` uses them as they are and
+            trains nothing. If empty, training begins with new weights.
     """
 
     scans: Count
@@ -72,6 +75,22 @@ class TrainingConfig(Settings):
     validation_scans: Count = 64
     checkpoint_every: Count = 1000
     pictures_every: NotNegative = 0
+    start: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.start == _FROZEN:  # not the current folder
+            raise ConfigError(f"start={_FROZEN}", "frozen:RUN, RUN, or nothing for new weights", "name the run")
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the stage is not trained: the weights of another run are used as they are."""
+        return self.start.startswith(_FROZEN)
+
+    @property
+    def start_run(self) -> str:
+        """Run whose weights of the stage are taken; "" for new weights."""
+        return self.start.removeprefix(_FROZEN)
 
 
 @dataclass(frozen=True)
@@ -86,11 +105,6 @@ class Preset(Settings):
         training: settings of the training, by the name of the stage.
         seed: seed of everything random: weights, order, augmentation, dropout.
         published: scores that a paper reports for the experiment, for the reader; empty if no paper does.
-        tokenizer_from: folder of a finished run whose tokenizer is used as it is; if empty, a tokenizer is trained.
-        stages_from: folder of a finished run whose stages are all used as they are; only stages that it lacks are
-            trained, such as a pixel decoder over a finished model.
-        train_anew: names of stages that are trained from new weights although the run of ``stages_from`` has them.
-        fine_tune: names of stages that start from the weights of the run of ``stages_from`` and are trained further.
     """
 
     title: str
@@ -100,29 +114,16 @@ class Preset(Settings):
     training: dict[str, TrainingConfig]
     seed: NotNegative = 0
     published: str = ""
-    tokenizer_from: str | None = None
-    stages_from: str | None = None
-    train_anew: tuple[str, ...] = ()
-    fine_tune: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for setting in ("tokenizer_from", "stages_from"):
-            if getattr(self, setting) == "":  # not the current folder
-                object.__setattr__(self, setting, None)
-        if self.tokenizer_from is not None and self.stages_from is not None:
-            raise ConfigError(
-                "tokenizer_from and stages_from together",
-                "one of them: the stages of a run include its tokenizer",
-                "leave tokenizer_from out",
-            )
-        for setting, stages in (("fine_tune", self.fine_tune), ("train_anew", self.train_anew)):
-            if stages and self.stages_from is None:
-                raise ConfigError(
-                    f"{setting}={stages[0]} without stages_from",
-                    "the run that has this stage",
-                    "set stages_from as well",
-                )
+    @property
+    def start_runs(self) -> dict[str, str]:
+        """Run whose weights a stage starts from or uses as they are, by the name of the stage."""
+        return {stage: config.start_run for stage, config in self.training.items() if config.start}
+
+    @property
+    def frozen(self) -> dict[str, str]:
+        """Run whose weights a stage uses as they are, by the name of the stage."""
+        return {stage: run for stage, run in self.start_runs.items() if self.training[stage].frozen}
 
     def settings_of(self, stage: str) -> TrainingConfig:
         """Return the settings of a stage's training.

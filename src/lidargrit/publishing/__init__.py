@@ -130,14 +130,19 @@ def _public_facts(about: dict[str, Any], generator: Generator) -> dict[str, Any]
     sources = {part: ["::".join(data_set_of(source)) for source in data.get(part, ())] for part in ("train", "val")}
     preset = {
         **preset,
-        "tokenizer_from": None,
-        "stages_from": None,
+        "training": _without_starts(preset.get("training", {})),
         "data": {**data, **sources, "sensor": generator.sensor.name},
     }
     kept = {name: about[name] for name in ("files", "lidargrit", "commit", "torch", "python") if name in about}
     if (taken := taken_over(about))["train"]:
-        kept["taken"] = {**taken, "train": ["::".join(data_set_of(source)) for source in taken["train"]]}
+        train = ["::".join(data_set_of(source)) for source in taken["train"]]
+        kept["taken"] = {**taken, "train": train, "training": _without_starts(taken["training"])}
     return {"origin": "published", **kept, "preset": preset}
+
+
+def _without_starts(training: dict[str, Any]) -> dict[str, Any]:
+    """Return settings of stages without the runs that they started from, which are folders of the user."""
+    return {stage: config and {**config, "start": ""} for stage, config in training.items()}
 
 
 def _check_scores(scores: Scorecard, run: Path) -> None:

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import product
@@ -21,7 +21,6 @@ from lidargrit.nn.precision import Precision
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.training.taken_stages import donors_of_stages, taken_stages
 
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
@@ -49,7 +48,7 @@ class StageCost:
         return round(self.flops_per_scan * scans) + self.preparation_flops(scans)
 
 
-def training_flops(preset: Preset, taken: Collection[str] | None = None) -> dict[str, int]:
+def training_flops(preset: Preset) -> dict[str, int]:
     """Count the floating-point operations of a preset's training, forward and backward, for each stage.
 
     Matrix products and convolutions are counted while a few steps run, on scans whose every pixel returns at 10 m. A
@@ -61,16 +60,13 @@ def training_flops(preset: Preset, taken: Collection[str] | None = None) -> dict
     counted alike. Only where the operations of an objective depend on values, as those of a network that completes
     scans do, are the steps computed.
 
-    Args:
-        taken: names of the stages that are taken from another run, if that is known already.
-
     Returns:
-        number of operations, by the name of the stage; none for stages that are taken from another run.
+        number of operations, by the name of the stage; none for frozen stages of another run.
     """
-    return {name: cost.flops(preset.settings_of(name).scans) for name, cost in stage_costs(preset, taken).items()}
+    return {name: cost.flops(preset.settings_of(name).scans) for name, cost in stage_costs(preset).items()}
 
 
-def stage_costs(preset: Preset, taken: Collection[str] | None = None) -> dict[str, StageCost]:
+def stage_costs(preset: Preset) -> dict[str, StageCost]:
     """Count the operations of every stage that is trained by its name, whatever number of scans it is trained on."""
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
@@ -78,8 +74,7 @@ def stage_costs(preset: Preset, taken: Collection[str] | None = None) -> dict[st
         with torch.device("meta"):
             generator = preset.build_generator(sensor).to("meta")
         costs = {}
-        taken = donors_of_stages(preset, taken_stages(preset, generator)) if taken is None else taken
-        for stage in (name for name in generator.stages if name not in taken):
+        for stage in (name for name in generator.stages if name not in preset.frozen):
             try:
                 costs[stage] = _cost_without_values(preset, generator, stage, sensor)
             except (RuntimeError, NotImplementedError):  # torch's for a value that was asked for, and for two devices
@@ -144,6 +139,14 @@ def with_budget(preset: Preset, flops: float) -> Preset:
     for _ in range(_CORRECTIONS):
         # What is prepared once, such as a reflow's pairs, does not grow or shrink in proportion.
         share *= flops / spent
+        for name in costs:
+            config, scans = preset.settings_of(name), preset.settings_of(name).scans * share
+            if scans < config.batch_size / 2:
+                raise ConfigError(
+                    f"a budget of {flops:.2g} operations, {scans:.1f} scans for {preset.generator}'s stage {name!r}",
+                    f"at least one batch of {config.batch_size} scans in every stage",
+                    f"raise it to {1.1 * flops * config.batch_size / scans:.2g}",
+                )
         trained = {name: _scaled(preset.settings_of(name), share) for name in costs}
         scaled = replace(preset, training={**preset.training, **trained}, model=_with_fewer_scans(preset.model, share))
         spent = _flops_of(costs, scaled)
@@ -160,12 +163,6 @@ def _flops_of(costs: Mapping[str, StageCost], preset: Preset) -> int:
 
 def _scaled(config: TrainingConfig, share: float) -> TrainingConfig:
     scans = round(config.scans * share / config.batch_size) * config.batch_size
-    if scans < config.batch_size:
-        raise ConfigError(
-            f"a budget for {config.scans * share:.1f} scans in batches of {config.batch_size}",
-            "at least one batch of every stage",
-            "raise the budget",
-        )
     return replace(
         config,
         scans=scans,

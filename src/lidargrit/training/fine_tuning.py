@@ -8,9 +8,8 @@ from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.run_folder import PRETRAINED
+from lidargrit.data.run_folder import PRETRAINED, locate, read_config
 from lidargrit.data.sources import open_source
-from lidargrit.generation.generator import load
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -78,7 +77,7 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
         val: scans to validate on; some of the scans are held out if empty.
     """
     config = _all_to_train(data, val) if val else divided(data)
-    own, made_by = load(PRETRAINED).sensor, load_sensor(sensor or config.sensor)
+    own, made_by = read_config(locate(PRETRAINED)).sensor, load_sensor(sensor or config.sensor)
     columns, stride = columns_like(own, made_by)
     if made_by.height != own.height:
         of = f"data.sensor={sensor or config.sensor} data.columns={columns} data.column_stride={stride}"

@@ -19,7 +19,7 @@ from lidargrit.scans.condition import Nothing
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.stage import follow_settings
-from lidargrit.training.taken_stages import donors_of_stages, taken_stages
+from lidargrit.training.taken_stages import taken_stages
 
 
 @dataclass(frozen=True)
@@ -127,19 +127,19 @@ class CheckedStages:
     Args:
         objectives: objective of every stage, without values, by the name of the stage.
         taken: trained stages of another run, which are taken as they are or trained further.
-        donors: run from which a stage is taken as it is, by the name of the stage; the others are trained.
+        frozen: run from which a stage is taken as it is, by the name of the stage; the others are trained.
         told: source of the condition that the generator is told of each scan.
     """
 
     objectives: Mapping[str, Objective]
     taken: Mapping[str, Objective]
-    donors: Mapping[str, str]
+    frozen: Mapping[str, str]
     told: ToldOfScans
 
     @property
     def trained(self) -> dict[str, Objective]:
         """The objectives of the stages that are trained, by name."""
-        return {name: objective for name, objective in self.objectives.items() if name not in self.donors}
+        return {name: objective for name, objective in self.objectives.items() if name not in self.frozen}
 
     def check_images(self, setting: str, images: RangeImages) -> None:
         """Refuse images that lack what a stage learns from, as their first one tells.
@@ -164,12 +164,11 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
         generator = preset.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
     taken = taken_stages(preset, generator)
-    donors = donors_of_stages(preset, taken)
     told = conditions.load(preset.data.condition)
     if told.kind is not Nothing and told.kind not in generator.takes:
         got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, which cannot be told it"
         raise ConfigError(got, "a generator that takes it", "leave it out")
-    checked = CheckedStages(objectives, taken, donors, told)
+    checked = CheckedStages(objectives, taken, preset.frozen, told)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)
     return checked
@@ -184,14 +183,13 @@ def plan_training(preset: Preset) -> TrainingPlan:
     """
     sensor = preset.data.load_sensor()
     checked, stages = check_stages(preset), []
-    flops = training_flops(preset, checked.donors)
+    flops = training_flops(preset)
     for name, objective in checked.objectives.items():
         parameters = sum(weight.numel() for weight in objective.parameters())
-        if name in checked.donors:
-            precision = preset.training[name].precision if name in preset.training else "fp32"
-            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, precision, checked.donors[name]))
-            continue
         budget = preset.settings_of(name)
+        if name in checked.frozen:
+            stages.append(StagePlan(name, parameters, 0, 0, 0, 0, budget.precision, checked.frozen[name]))
+            continue
         size = (parameters, budget.scans, budget.batch_size, memory_of_weights(objective))
         stages.append(StagePlan(name, *size, flops[name], budget.precision))
     return TrainingPlan(

@@ -5,9 +5,10 @@ import hashlib
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,7 @@ def _train(
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
         torch.manual_seed(derive_seed(preset.seed, 9))
         generator = preset.build_generator()
-        engine.by_first(lambda: _claim(folder, preset, checked.donors, train_images, val_images))
+        engine.by_first(lambda: _claim(folder, preset, train_images, val_images))
         generator.fit_statistics(train_images)
 
         def training_of(number: int, stage: str, built_on: str) -> StageTraining:
@@ -110,7 +111,7 @@ def _train(
 
         built_on = ""
         for number, stage in enumerate(generator.stages):
-            if stage in checked.donors:
+            if stage in checked.frozen:
                 trained = checked.taken[stage]
             else:
                 trained = training_of(number, stage, built_on).run(train_images, val_images, f"training {stage}")
@@ -158,9 +159,7 @@ def check_folder(folder: Path, preset: Preset) -> None:
         )
 
 
-def _claim(
-    folder: Path, preset: Preset, donors: Mapping[str, str], train_images: RangeImages, val_images: RangeImages
-) -> None:
+def _claim(folder: Path, preset: Preset, train_images: RangeImages, val_images: RangeImages) -> None:
     """Write ``run.json``, or check that a resumed run has the data with which it began."""
     data = {
         "sensor": train_images.sensor.to_json(),
@@ -184,12 +183,12 @@ def _claim(
                     "what it began with",
                     "restore it, or choose another folder",
                 )
-        _write_trained_on(folder, train_images, preset.tokenizer_from or preset.stages_from)
+        _write_trained_on(folder, train_images, preset.start_runs.values())
         return
     about: dict[str, Any] = {
         "preset": configuration.to_json(preset),
         "data": data,
-        **({"taken": taken_facts(preset, donors)} if donors or preset.fine_tune else {}),
+        **({"taken": taken_facts(preset)} if preset.start_runs else {}),
         "command": sys.argv,
         "lidargrit": __version__,
         "commit": _commit(),
@@ -197,21 +196,20 @@ def _claim(
         "python": platform.python_version(),
     }
     write_json(folder / RUN_FILE, about)
-    _write_trained_on(folder, train_images, preset.tokenizer_from or preset.stages_from)
+    _write_trained_on(folder, train_images, preset.start_runs.values())
 
 
-def _write_trained_on(folder: Path, train_images: RangeImages, donor: str | None) -> None:
+def _write_trained_on(folder: Path, train_images: RangeImages, donors: Iterable[str]) -> None:
     """Write what the model learns from: the training scans, and those of the stages that it takes."""
     if (folder / TRAINED_ON_FILE).exists():
         return
-    ours = train_images.provenance
-    theirs = trained_on(locate(donor)) if donor is not None else Provenance()
+    learned = [train_images.provenance, *(trained_on(locate(donor)) for donor in sorted({*donors}))]
     write_trained_on(
         folder,
         Provenance(
-            recordings=ours.recordings + theirs.recordings,
-            fingerprints=ours.fingerprints + theirs.fingerprints,
-            range_fingerprints=ours.range_fingerprints + theirs.range_fingerprints,
+            recordings=tuple(chain.from_iterable(each.recordings for each in learned)),
+            fingerprints=tuple(chain.from_iterable(each.fingerprints for each in learned)),
+            range_fingerprints=tuple(chain.from_iterable(each.range_fingerprints for each in learned)),
         ),
     )
 

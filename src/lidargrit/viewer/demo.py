@@ -12,14 +12,14 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import CheckpointError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import PRETRAINED, RUN_FILE
+from lidargrit.data.run_folder import PRETRAINED, RUN_FILE, locate, read_config
 from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.generator import Generator
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
 from lidargrit.inference.samples import write_samples
@@ -29,7 +29,6 @@ from lidargrit.training import check_folder, train
 from lidargrit.training.fine_tuning import divided
 from lidargrit.training.log import LOG_FILE, read_log
 from lidargrit.training.measure import measure
-from lidargrit.training.plan import check_stages
 from lidargrit.viewer import plot_comparison
 from lidargrit.viewer.demo_page import DemoPage, reconstructed, write_demo_page
 
@@ -120,7 +119,7 @@ def _facts(preset: Preset, generator: Generator, scans: str) -> tuple[str, ...]:
 def how_trained(preset: Preset) -> str:
     """Return which networks the demo trains anew, trains further and takes as they are, in a sentence for each."""
     stages = _trained_stages(preset)
-    further = [stage for stage in stages if stage in preset.fine_tune]
+    further = [stage for stage in stages if preset.training[stage].start]
     sentences = (
         ([stage for stage in _STAGES if stage not in stages], "comes", "come", "as trained, from {package}"),
         (further, "learns", "learn", "further here, from the weights of {package}"),
@@ -148,21 +147,19 @@ def _preset(data: str | None, settings: list[str], anew: bool) -> Preset:
 
     if not anew:
         preset = preset_of("lidargrit_demo_transformer" if config is None else "lidargrit_demo_fine_tuned")
-        if preset.data.load_sensor().same_rays(load(PRETRAINED).sensor):
+        if preset.data.load_sensor().same_rays(read_config(locate(PRETRAINED)).sensor):
             return preset
         reporting.message("the model in the package is of another sensor or image size, so all is trained anew")
     return preset_of("lidargrit_demo_pixels")
 
 
 def _trained_stages(preset: Preset) -> list[str]:
-    donors = check_stages(preset).donors
-    return [stage for stage in _STAGES if stage in preset.training and stage not in donors]
+    return [stage for stage in _STAGES if stage in preset.training and not preset.training[stage].frozen]
 
 
 def _sampling(preset: Preset) -> TokenSampling:
     """Return how new scans are sampled: sharper where the pixel decoder was trained anew."""
-    begun_anew = "pixels" in _trained_stages(preset) and "pixels" not in preset.fine_tune
-    return _SHARPER if begun_anew else _DEFAULT
+    return _DEFAULT if preset.training["pixels"].start else _SHARPER
 
 
 def _expected_s(preset: Preset, simulates: bool) -> dict[str, float]:

@@ -26,8 +26,6 @@ PRESETS = {
         "a network that completes scans: 64x1024, for one CPU core and half an hour",
         WIDE_STREETS,
         CompletionConfig(),
-        stages_from="pretrained/completion",
-        fine_tune=("completion",),
         completion=replace(
             _COMPLETION,
             scans=2500,
@@ -38,6 +36,7 @@ PRESETS = {
             validate_every=500,
             validation_scans=12,
             checkpoint_every=250,
+            start="pretrained/completion",
         ),
     ),
 }

@@ -157,7 +157,13 @@ _FOR_A_DEMO = {
     "training.transformer.validation_scans": 16,
     "training.transformer.checkpoint_every": 480,
 }
-_FURTHER = {"warmup_scans": 40, "validate_every": 400, "validation_scans": 8, "checkpoint_every": 80}
+_FURTHER = {
+    "warmup_scans": 40,
+    "validate_every": 400,
+    "validation_scans": 8,
+    "checkpoint_every": 80,
+    "start": "pretrained",
+}
 _STAGES = _COMPACT_PIXELS.training
 
 PRESETS = {
@@ -187,12 +193,19 @@ PRESETS = {
             "data": replace(shared.WIDE_STREETS, train=("simulated:70000:train",)),
             # An image of 64x1024 is as much to learn from as four of 64x256.
             "training.tokenizer": replace(
-                _STAGES["tokenizer"], scans=800, batch_size=1, learning_rate=5e-4, validate_every=400
+                _STAGES["tokenizer"],
+                scans=800,
+                batch_size=1,
+                learning_rate=5e-4,
+                validate_every=400,
+                start="pretrained",
             ),
-            "training.transformer": replace(_STAGES["transformer"], scans=17_600, batch_size=4, validate_every=1200),
-            "training.pixels": replace(shared.PIXELS, scans=12_200, batch_size=1, learning_rate=1e-3),
-            "stages_from": "pretrained",
-            "fine_tune": ("tokenizer", "transformer", "pixels"),
+            "training.transformer": replace(
+                _STAGES["transformer"], scans=17_600, batch_size=4, validate_every=1200, start="pretrained"
+            ),
+            "training.pixels": replace(
+                shared.PIXELS, scans=12_200, batch_size=1, learning_rate=1e-3, start="pretrained"
+            ),
         },
     ),
     "lidargrit_fine_wide": preset(
@@ -229,8 +242,8 @@ PRESETS = {
             "training.transformer": replace(
                 _STAGES["transformer"], scans=160, learning_rate=6e-4, average_over_scans=40, **_FURTHER
             ),
-            "stages_from": "pretrained",
-            "fine_tune": ("transformer",),
+            "training.tokenizer.start": "frozen:pretrained",
+            "training.pixels.start": "frozen:pretrained",
         },
     ),
     "lidargrit_demo_fine_tuned": variant(
@@ -245,8 +258,6 @@ PRESETS = {
                 _STAGES["transformer"], scans=800, learning_rate=6e-4, average_over_scans=80, **_FURTHER
             ),
             "training.pixels": replace(shared.PIXELS, scans=240, learning_rate=4e-4, average_over_scans=40, **_FURTHER),
-            "stages_from": "pretrained",
-            "fine_tune": ("tokenizer", "transformer", "pixels"),
         },
     ),
     # Few codes, a small transformer and small batches: more to learn from as few scans as minutes allow.

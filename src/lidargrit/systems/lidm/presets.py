@@ -76,7 +76,7 @@ _KITTI_360 = preset(  # 15.1 M and 257.8 M parameters
 )
 
 PRESETS = {"lidm_small": _SMALL, "lidm_kitti_360": _KITTI_360}
-# With ``--set tokenizer_from=RUN`` these take the very tokenizer of a trained run of lidargrit_small or
+# With ``--set training.tokenizer.start=frozen:RUN`` these take the very tokenizer of a run of lidargrit_small or
 # lidargrit_kitti_360, and the two systems differ in nothing but what generates the codes. Of the variance of the small
 # one's codes 98 % lie in four of 64 axes: noise is added along them alone, each in its own standard deviation.
 TO_COMPARE_WITH = {

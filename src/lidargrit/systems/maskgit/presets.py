@@ -14,7 +14,7 @@ TO_COMPARE_WITH = {
         tokenizer=shared.SMALL_STAGES["tokenizer"],
         transformer=shared.SMALL_STAGES["transformer"],
     ),
-    # The tokenizer of a run of lidargrit_demo can be taken by ``tokenizer_from``.
+    # The tokenizer of a run of lidargrit_demo can be taken by ``training.tokenizer.start``.
     "maskgit_demo": preset(
         "MaskGIT, demo: the small model for a few minutes",
         shared.DEMO_STREETS,

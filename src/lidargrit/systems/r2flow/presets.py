@@ -24,7 +24,7 @@ _KITTI_360 = preset(  # 80.9 M parameters
 _FURTHER = replace(MINUTES, scans=8_000, learning_rate=3e-4, warmup_scans=200, augmentations=())  # pairs do not mirror
 
 PRESETS = {"r2flow_small": _SMALL, "r2flow_kitti_360": _KITTI_360}
-# With ``--set stages_from=RUN`` these take the flow of a trained run of the presets above, and train the rest.
+# With ``--set training.flow.start=frozen:RUN`` these take the flow of a run of the presets above, and train the rest.
 TO_COMPARE_WITH = {
     "r2flow_small_reflow": variant(
         "R2Flow (2-RF, 1-TD), small: 64x256 in one step, for two CPU cores",
