@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> None:
     """Project one scan and print what became of it."""
     from lidargrit.core import reporting
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.sources.first_scan import first_scan
+    from lidargrit.data.sources.named import first_scan
     from lidargrit.scans.projection.inspection import as_json, as_table, inspect
     from lidargrit.scans.projection.sensor_check import closest_sensor, projection_that_fits
     from lidargrit.scans.sensors import load_sensor
