@@ -1,4 +1,4 @@
-"""Decisions with known probabilities ⇄ 32-bit words: a range coder, and how integers and steps of range become decisions."""
+"""Decisions with known probabilities ⇄ 32-bit words: a range coder, and how integers and ranges become decisions."""
 
 import importlib
 from abc import ABC, abstractmethod
