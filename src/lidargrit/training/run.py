@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -205,14 +204,7 @@ def _write_trained_on(folder: Path, train_images: RangeImages, donors: Iterable[
     if (folder / TRAINED_ON_FILE).exists():
         return
     learned = [train_images.provenance, *(trained_on(locate(donor)) for donor in sorted({*donors}))]
-    write_trained_on(
-        folder,
-        Provenance(
-            recordings=tuple(chain.from_iterable(each.recordings for each in learned)),
-            fingerprints=tuple(chain.from_iterable(each.fingerprints for each in learned)),
-            range_fingerprints=tuple(chain.from_iterable(each.range_fingerprints for each in learned)),
-        ),
-    )
+    write_trained_on(folder, Provenance.joined(learned))
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages) -> None:
