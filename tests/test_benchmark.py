@@ -172,8 +172,10 @@ def test_a_budget_scales_all_stages_alike():
     vae = load_preset("lidarvae_small")
     short = with_budget(vae, sum(training_flops(vae).values()) / 4)
     assert short.model.warmup_scans == pytest.approx(vae.model.warmup_scans / 4, rel=0.01)
-    with pytest.raises(ConfigError, match="at least one batch"):
+    with pytest.raises(ConfigError, match="at least one batch") as refused:
         with_budget(preset, 1e6)
+    enough = with_budget(preset, float(refused.value.cure.removeprefix("raise it to ")))
+    assert all(fit.scans >= fit.batch_size for fit in enough.training.values())
     lacking = load_preset("r2flow_small")
     lacking = replace(lacking, model=replace(lacking.model, reflow=ReflowConfig()))
     for count in (training_flops, lambda preset: with_budget(preset, 1e13)):

@@ -17,7 +17,7 @@ from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.formats.ply import Ply
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import open_images
+from lidargrit.data.sources import open_images, open_source
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
@@ -106,6 +106,7 @@ def test_samples_that_were_added_are_not_taken_for_those_completed_before(folder
     words += ["--model", f"{folders}/wide_run"]
     write_samples(model, folders / "wide_run", samples, [10, 11])
     assert main(words) == 0
+    assert open_source(words[2]).sensor.same_rays(model.sensor)
     write_samples(model, folders / "wide_run", samples, [4])
     assert main(words) == 2
     assert "000000.npy is another scan of" in capsys.readouterr().err

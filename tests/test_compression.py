@@ -11,6 +11,8 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.data.sources import open_source
+from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
@@ -196,6 +198,7 @@ def test_the_commands_restore_what_was_compressed(tmp_path, capsys):
     assert main(["decompress", file, out, "--model", run, "--only", "1"]) == 0
     assert [one.name for one in Path(out).iterdir() if one.suffix == ".npy"] == ["1.npy"]
     assert main(["decompress", file, out, "--model", run]) == 0
+    assert open_source(out).sensor.same_rays(load(run).sensor)
     for index, range_m in enumerate(scans(2).range_m):
         assert np.abs(np.load(Path(out) / f"{index}.npy") - range_m.numpy()).max() <= 0.01 + 1e-6
     capsys.readouterr()
@@ -248,7 +251,7 @@ def test_a_first_scan_that_is_not_restored_leaves_the_folder_to_a_corrected_comm
         with pytest.raises(AttributeError):
             main(["decompress", "scans.lgz", "out", "--model", "run"])
     assert main(["decompress", "scans.lgz", "out", "--model", "run", "--format", "pcd"]) == 0
-    assert sorted(os.listdir("out")) == ["0.pcd", "decompressed.json"]
+    assert sorted(os.listdir("out")) == ["0.pcd", "decompressed.json", "sensor.json"]
 
 
 def test_an_interrupted_file_goes_on_only_with_the_options_that_say_which_scans(two_sources, capsys, monkeypatch):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lidargrit.cli._options import add_count, add_device, add_scans, sampling_words, scan_settings
+from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, whole_number
 
@@ -77,7 +78,7 @@ def run_task(options: argparse.Namespace, model: "Model", task: "Task", probabil
     config = scan_settings(options, max_scans=options.count).data
     found = complete_scans(options.scans, options.out, model, task, output, config)
     print(f"done: {counted_scans(found.scans)} in {options.out}{_points(found, task)}")
-    print(f"look at {'it' if found.scans == 1 else 'them'}: {_view(options, found, model)}")
+    print(look_at(options.out))
 
 
 def _points(found: "Written", task: "Task") -> str:
@@ -89,16 +90,3 @@ def _points(found: "Written", task: "Task") -> str:
     kept = found.points_out - found.points_filled
     left = f", {found.points_in - kept:,} that --observed hides left out" if kept < found.points_in else ""
     return f": {found.points_out:,} points, {kept:,} measured and {found.points_filled:,} filled{left}"
-
-
-def _view(options: argparse.Namespace, found: "Written", model: "Model") -> str:
-    out = f"'{options.out}'" if " " in str(options.out) else str(options.out)
-    if found.sensor_file is None:
-        return f"lidargrit view {out} --sensor {model.sensor.name} --set data.columns={_columns(model)}"
-    return f"lidargrit view {out} -o {options.out.name}.html"
-
-
-def _columns(model: "Model") -> str:
-    sensor = model.sensor
-    stride = f" data.column_stride={sensor.column_stride}" if sensor.column_stride > 1 else ""
-    return f"{sensor.width * sensor.column_stride}{stride}"

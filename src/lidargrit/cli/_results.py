@@ -6,6 +6,7 @@ to that file besides the table. Progress, warnings and "done" are then on standa
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,6 +18,11 @@ from lidargrit.core.files import plain, refuse_to_overwrite, write_json
 from lidargrit.core.untrusted import check_path
 
 STANDARD_OUTPUT = Path("-")
+
+
+def look_at(folder: Path, *options: str) -> str:
+    """Return the command that shows the scans of a folder, for the last line of a verb that wrote them."""
+    return "look at them: " + shlex.join(["lidargrit", "view", str(folder), *options, "-o", f"{folder.name}.html"])
 
 
 def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json") -> None:

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import whole_number
 
@@ -32,4 +33,4 @@ def run(options: argparse.Namespace) -> None:
 
     named = (options.file, options.out, options.model, options.format, options.only)
     count = decompress_scans(*named)
-    print(f"done: {counted_scans(count)} in {options.out}; decompressed.json says where they come from")
+    print(f"done: {counted_scans(count)} in {options.out}; {look_at(options.out)}")

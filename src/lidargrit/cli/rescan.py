@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_count, add_scans, scan_settings
+from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import signed_number
 
@@ -40,5 +41,4 @@ def run(options: argparse.Namespace) -> None:
     source = open_source(options.scans, settings.data.bad_points)
     change = Rescan(sensor_for(source, settings.sensor), other, options.raised_m)
     count = export_scans(options.scans, options.out, options.format, settings.data, change=change)
-    look = f"lidargrit view {options.out} --sensor {options.to}"
-    print(f"done: {counted_scans(count)} in {options.out}; look at them: {look}")
+    print(f"done: {counted_scans(count)} in {options.out}; {look_at(options.out, '--sensor', options.to)}")

@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_settings, sampling_words
+from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row
 
@@ -49,4 +50,4 @@ def run(options: argparse.Namespace) -> None:
     sampling = generator.parse_sampling(sampling_words(options.set))
     seeds = seeds[rank::world_size]
     write_samples(generator, run_folder, options.out, seeds, sampling)
-    print(f"done: {counted_scans(len(seeds))} in {options.out}; look at them with: lidargrit view {options.out}")
+    print(f"done: {counted_scans(len(seeds))} in {options.out}; {look_at(options.out)}")

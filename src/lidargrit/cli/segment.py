@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
-from lidargrit.cli._results import add_json, print_result, refuse_taken
+from lidargrit.cli._results import add_json, look_at, print_result, refuse_taken
 from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
@@ -41,6 +41,6 @@ def run(options: argparse.Namespace) -> None:
     refuse_other_sensor(settings, options.model, "segment")
     count, scores = segment_scans(*named, settings.data, options.device, options.compare)
     found = scores.as_json() if scores else {}
-    done = f"done: {counted_scans(count, 'labelled')} in {options.out}; see them with: lidargrit view {options.out}"
+    done = f"done: {counted_scans(count, 'labelled')} in {options.out}; {look_at(options.out)}"
     result = {"source": options.scans, "model": options.model, "scans": count, **found}
     print_result(options, scores.as_table() if scores else done, result, done if scores else "")

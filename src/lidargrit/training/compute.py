@@ -139,6 +139,14 @@ def with_budget(preset: Preset, flops: float) -> Preset:
     for _ in range(_CORRECTIONS):
         # What is prepared once, such as a reflow's pairs, does not grow or shrink in proportion.
         share *= flops / spent
+        for name in costs:
+            config, scans = preset.settings_of(name), preset.settings_of(name).scans * share
+            if scans < config.batch_size / 2:
+                raise ConfigError(
+                    f"a budget of {flops:.2g} operations, {scans:.1f} scans for {preset.generator}'s stage {name!r}",
+                    f"at least one batch of {config.batch_size} scans in every stage",
+                    f"raise it to {1.1 * flops * config.batch_size / scans:.2g}",
+                )
         trained = {name: _scaled(preset.settings_of(name), share) for name in costs}
         scaled = replace(preset, training={**preset.training, **trained}, model=_with_fewer_scans(preset.model, share))
         spent = _flops_of(costs, scaled)
@@ -155,12 +163,6 @@ def _flops_of(costs: Mapping[str, StageCost], preset: Preset) -> int:
 
 def _scaled(config: TrainingConfig, share: float) -> TrainingConfig:
     scans = round(config.scans * share / config.batch_size) * config.batch_size
-    if scans < config.batch_size:
-        raise ConfigError(
-            f"a budget for {config.scans * share:.1f} scans in batches of {config.batch_size}",
-            "at least one batch of every stage",
-            "raise the budget",
-        )
     return replace(
         config,
         scans=scans,

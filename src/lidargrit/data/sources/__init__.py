@@ -266,7 +266,7 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     if "://" in text or (here and is_prepared(text)):
         return PreparedSource(text)
     images = image_files(folder) if text and (here or folder.is_file()) else []
-    return ImageFileSource(text, images) if images else DatasetSource(text, bad_points)
+    return ImageFileSource(text, folder, images) if images else DatasetSource(text, bad_points)
 
 
 def load_range_images(sources: Sequence[str], config: DataConfig, sensor: SensorModel | None = None) -> RangeImages:

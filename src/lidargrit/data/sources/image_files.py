@@ -11,7 +11,7 @@ from lidargrit.core.determinism import evenly_spaced, natural_order
 from lidargrit.core.errors import ConfigError, DataError, LidarGritError, ScanError, printable
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
-from lidargrit.data.datasets.folder import Folder
+from lidargrit.data.datasets.folder import SENSOR_FILE, Folder
 from lidargrit.data.datasets.shared.files import is_recognised, scans_below
 from lidargrit.data.formats import read_bytes
 from lidargrit.data.images import Pixels, Provenance, RangeImages
@@ -31,18 +31,21 @@ class ImageFileSource(Source):
 
     Args:
         text: name of the source.
+        folder: file, or folder that was named.
         paths: files, in their order.
     """
 
     kind = "range images"
 
-    def __init__(self, text: str, paths: Sequence[Path]) -> None:
+    def __init__(self, text: str, folder: Path, paths: Sequence[Path]) -> None:
         super().__init__(text)
-        self._paths = paths
+        self._folder, self._paths = folder, paths
 
     @property
     def sensor(self) -> SensorModel:
-        """Sensor that is taken for a folder of scans, if the first image has its size."""
+        """Sensor of the file beside the images, else that of a folder of scans if the first image has its size."""
+        if (beside := self._folder / SENSOR_FILE).is_file():
+            return load_sensor(str(beside))
         size, usual = _array(self._paths[0]).shape, load_sensor(Folder.sensor)
         if size == (usual.height, usual.width):
             return usual
@@ -66,12 +69,13 @@ class ImageFileSource(Source):
 
 
 def image_files(path: Path) -> list[Path]:
-    """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none."""
-    try:
-        found = [path] if path.is_file() else natural_order(path.iterdir())
-    except (OSError, ValueError):
-        return []
-    found = [one for one in found if one.is_file() and not one.name.startswith(".") and formats.candidates(one)]
+    """Return the range images that a path names: one ``.npy``, or those of a folder of nothing else; else none.
+
+    They may all lie in one folder below.
+    """
+    found = [
+        one for one in _entries(path) if one.is_file() and not one.name.startswith(".") and formats.candidates(one)
+    ]
     found = [one for one in found if not one.name.endswith(PROBABILITY)]
     others = [one for one in found if one.suffix.lower() != ".npy"]
     if len(others) == len(found) or any(map(is_recognised, others)):
@@ -91,11 +95,22 @@ def image_files(path: Path) -> list[Path]:
     _refuse_mask(array, first)
     for one in found:
         user_path(str(one.absolute()))  # refuses a name that is not UTF-8, which others could not write again
-    below = (one for one in scans_below(path) if one.parent != path and is_recognised(one))
+    below = (one for one in scans_below(path) if one.parent != first.parent and is_recognised(one))
     if path.is_dir() and (further := next(below, None)):
         what = f"{path}, with range images and, in {further.parent}, further scans"
         raise DataError(what, "a folder of range images alone", "move one of them elsewhere")
     return found
+
+
+def _entries(path: Path) -> list[Path]:
+    """Return what lies in a folder, or in the one folder below where it holds no scan itself."""
+    try:
+        found = [path] if path.is_file() else natural_order(path.iterdir())
+        below = [one for one in found if one.is_dir() and not one.name.startswith(".")]
+        has_scans = any(formats.candidates(one) for one in found if one.is_file())
+        return _entries(below[0]) if len(below) == 1 and not has_scans else found
+    except (OSError, ValueError):
+        return []
 
 
 class _ImageFiles:

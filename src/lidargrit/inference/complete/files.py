@@ -65,14 +65,12 @@ class Written:
         points_in: number of points of the scans that were read now; 0 for range images.
         points_out: number of points of the files that were written now.
         points_filled: number of these that a model added.
-        sensor_file: file of the sensor on whose rays the points lie; None beside range images.
     """
 
     scans: int
     points_in: int = 0
     points_out: int = 0
     points_filled: int = 0
-    sensor_file: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,36 +110,37 @@ def write_completions(
     folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans)
     jobs = _jobs(inputs, folder, model, task, output)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
-    sensor_file, counts = None if output.format == IMAGE else out / SENSOR_FILE, np.zeros(3, dtype=np.int64)
+    counts = np.zeros(3, dtype=np.int64)
     with folder.writing(task.progress) as progress:
         for batch in _batches(chain(first, jobs), model.generator.compute_batch):
             for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
                 file = files[job.index * output.count + job.turn]
                 if output.probability and job.turn == 0:
                     write_array(out / _probability_file(file), _return_share(model, job, output))
-                if sensor_file is None:
+                if not (out / SENSOR_FILE).exists():
+                    own = images.sensor if output.format == IMAGE else task.sensor_of_points(job.scan)
+                    write_json(out / SENSOR_FILE, own.to_json())
+                if output.format == IMAGE:
                     write_array(out / file, images.range_m[0])
                     kept_labels = images.label is None
                 else:
-                    kept_labels, points = _write_cloud(out / file, sensor_file, output.format, task, job, images)
+                    kept_labels, points = _write_cloud(out / file, output.format, task, job, images)
                     counts += points
                 if not kept_labels:
                     folder.tell_labels_lost(file)
                 progress.advance(1)
     points_in, points_out, points_filled = counts.tolist()
-    return Written(folder.num_written, points_in, points_out, points_filled, sensor_file)
+    return Written(folder.num_written, points_in, points_out, points_filled)
 
 
 def _write_cloud(
-    path: Path, sensor_file: Path, kind: str, task: Task, job: _Job, images: RangeImage
+    path: Path, kind: str, task: Task, job: _Job, images: RangeImage
 ) -> tuple[bool, Int64[np.ndarray, "3"]]:
-    """Write a completed cloud, and the sensor of the first one.
+    """Write a completed cloud.
 
     Returns:
         whether its labels are kept; points that came in, that went out, and that were filled.
     """
-    if not sensor_file.exists():
-        write_json(sensor_file, task.sensor_of_points(job.scan).to_json())
     seen = InputScan.of_image(job.scan.image) if job.scan.points is None else job.scan
     done = task.result(seen, job.condition, images)
     kept_labels = write_cloud(path, kind, done, job.form)
