@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     from lidargrit.core import reporting
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.sources.first_scan import first_scan
+    from lidargrit.data.sources.named import first_scan
     from lidargrit.scans.projection.inspection import as_json, as_table, inspect
     from lidargrit.scans.projection.sensor_check import closest_sensor, projection_that_fits
     from lidargrit.scans.sensors import load_sensor
