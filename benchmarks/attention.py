@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lidargrit.nn.attention import attend
+from lidargrit.nn.transformer import attend
 
 ROUNDS = 8
 SIZES = {  # heads, tokens, channels of a head, causal

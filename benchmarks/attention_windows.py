@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from lidargrit.systems.r2flow.neighbourhood import neighbourhood_attention
+from lidargrit.systems.r2flow.hdit import neighbourhood_attention
 
 ROUNDS = 5
 LEVELS = {  # heads, rows, columns, channels of a head

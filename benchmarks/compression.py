@@ -24,7 +24,7 @@ from lidargrit.core.files import write_json
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_images
-from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.intervals import Estimate
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.range_steps import RangeSteps

@@ -23,7 +23,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.metrics.shared.curves import divergence
-from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, pair_of, simulate_pair
+from lidargrit.evaluation.realism import CURVES, SimulatedScans, compare, pair_of, simulate_pair, tables
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import observation
@@ -225,7 +225,8 @@ def main() -> None:
     for source in filter(None, ("train", options.val)):
         scans = real if source == "train" else load_range_images((source,), config, sensor)
         for what, which in (("before", model), ("after", fitted))[: 2 if options.rounds else 1]:
-            print(f"\n{source}, {what} the fit, other seeds\n{as_table(compare(simulated(held_out, which), scans))}")
+            (table,) = tables(compare(simulated(held_out, which), scans))
+            print(f"\n{source}, {what} the fit, other seeds\n{table.as_text()}")
 
 
 if __name__ == "__main__":

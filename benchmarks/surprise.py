@@ -26,7 +26,7 @@ from torch import Tensor
 from lidargrit.core.files import write_json
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_images
-from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.intervals import Estimate
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.range_values import encode
 from lidargrit.nn.random import SeededNoise

@@ -4,8 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from lidargrit.nn.attention import attend
-from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.nn.transformer import CausalTransformer, TransformerConfig, attend
 
 
 def by_definition(query, key, value, causal):

@@ -30,6 +30,20 @@ def cloud(tmp_path_factory) -> Path:
     return folder
 
 
+def test_points_beside_the_pixels_are_bounded_and_the_others_counted(cloud, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("lidargrit.viewer.scan_sets._BESIDE_AT_MOST", 100)
+    out, scan = tmp_path / "v.html", read_scan(cloud / "a.npz")
+    words_of = ["view", str(cloud), "-o", str(out), "--projection", "spherical", "--sensor", "hdl64e_kitti_odometry"]
+    assert main(words_of) == 0
+    (one,) = page_data(out.read_text(encoding="utf-8"))["sources"][0]["scans"]
+    in_pixels = int((unpacked(one["range"], "<u2") > 0).sum())
+    assert len(unpacked(one["beside"], "<f4")) == 3 * 100
+    assert one["hidden"] == len(scan) - in_pixels - 100 > 0
+    assert f"{one['hidden']:,} of {len(scan):,} points are hidden, since a page shows 100 points beside" in (
+        capsys.readouterr().err
+    )
+
+
 @pytest.mark.parametrize("options", [[], ["--set", "data.columns=256"]])
 def test_every_point_is_shown_or_counted_as_hidden(cloud, options, tmp_path, capsys, browser):
     out, scan = tmp_path / "v.html", read_scan(cloud / "a.npz")

@@ -18,7 +18,8 @@ from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.formats.ply import Ply
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_images, open_source
-from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, raydrop_table, score_raydrop
+from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, score_raydrop
+from lidargrit.evaluation.realism import tables
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.inference.complete import open_model, open_models
@@ -290,9 +291,9 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
     every = torch.ones_like(true.return_mask)
     clean = RangeImage.masked(torch.where(true.return_mask, true.range_m, 30.0), every, SENSOR)
     scores = score_raydrop(model, "simulated", clean, true)
-    assert [score.model.metric for score in scores] == list(RAYDROP_CURVES)
-    assert all(score.real_against_real.value < 1e-3 < min(score.model.value, score.bernoulli.value) for score in scores)
-    assert raydrop_table(scores).count("\n") == 5
+    assert [score.own.metric for score in scores] == list(RAYDROP_CURVES)
+    assert all(score.real_against_real.value < 1e-3 < min(score.own.value, score.bernoulli.value) for score in scores)
+    assert [row[0] for row in tables(scores)[0].rows] == ["scans compared", *RAYDROP_CURVES]
     decoded, same = decoded_surfaces(model, open_images(f"{folders}/scans", SENSOR))
     returns = same.return_mask.any(0)
     assert bool(returns.any())

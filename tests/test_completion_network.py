@@ -16,8 +16,7 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.hints import hints_of
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion.objective import CompletionObjective, random_patterns
-from lidargrit.systems.completion.system import Completion, CompletionConfig
+from lidargrit.systems.completion.system import Completion, CompletionConfig, CompletionObjective, random_patterns
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.training.taken_stages import taken_stages
 from tiny_runs import learn, save_bundle

@@ -19,7 +19,7 @@ from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.inference.compress import rounding
 from lidargrit.inference.compress.archive import writing
-from lidargrit.inference.compress.arithmetic import exp, ln, sigmoid
+from lidargrit.inference.compress.rounding import exp, ln, sigmoid
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.scans.sensors import load_sensor

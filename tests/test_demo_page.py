@@ -18,6 +18,7 @@ from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.systems.lidargrit.system import LidarGrit
 from lidargrit.viewer import demo
+from lidargrit.viewer.demo_page import DemoPage, nearest_scans, write_demo_page
 from lidargrit.viewer.report_charts import score_chart
 from test_generator_contract import SENSOR, Store, made
 
@@ -54,9 +55,8 @@ def written(tmp_path_factory, scored) -> Path:
     folder.mkdir()
     generator, val = made("lidargrit")[0], RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.write_results_page(
-        generator, "simulated", val, val, scored[0], errors, scored[1], SECONDS, ("a <fact>",), folder
-    )
+    page = DemoPage(generator, "simulated", val, val, scored[0], errors, scored[1], SECONDS, ("a <fact>",), folder)
+    write_demo_page(page, folder / "demo.html")
     return folder / "demo.html"
 
 
@@ -68,7 +68,8 @@ def with_pixel_decoder(tmp_path_factory, scored) -> Path:
     generator = LidarGrit(replace(plain.config, pixels=sizes), SENSOR).eval()
     val = RangeImages(SENSOR, [Named()])
     errors = score_reconstruction(generator.get_tokenizer(), val)
-    demo.write_results_page(generator, "simulated", val, val, scored[0], errors, scored[1], SECONDS, (), folder)
+    page = DemoPage(generator, "simulated", val, val, scored[0], errors, scored[1], SECONDS, (), folder)
+    write_demo_page(page, folder / "demo.html")
     return folder / "demo.html"
 
 
@@ -141,7 +142,7 @@ def test_the_nearest_scan_is_that_of_a_loop_over_pixels():
     real = RangeImages(SENSOR, [Store()])
     new = real.batch([7, 3])
     new = replace(new, range_m=new.range_m * 1.01)
-    assert demo._nearest(new, real) == [7, 3]
+    assert nearest_scans(new, real) == [7, 3]
     other = real.batch([1])
     sums = []
     for index in range(len(real)):
@@ -150,7 +151,7 @@ def test_the_nearest_scan_is_that_of_a_loop_over_pixels():
         sums.append(
             sum(abs(math.log1p(float(one[at])) - math.log1p(float(1.3 * other.range_m[0][at]))) for at in pixels)
         )
-    assert demo._nearest(replace(other, range_m=1.3 * other.range_m), real) == [int(np.argmin(sums))]
+    assert nearest_scans(replace(other, range_m=1.3 * other.range_m), real) == [int(np.argmin(sums))]
 
 
 def test_times_are_those_of_the_first_time(tmp_path):

@@ -14,8 +14,14 @@ from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.dusty.raydrop import logistic_noise, straight_through
-from lidargrit.systems.dusty.system import Dusty, DustyConfig, DustySampling, InverseRange
+from lidargrit.systems.dusty.system import (
+    Dusty,
+    DustyConfig,
+    DustySampling,
+    InverseRange,
+    logistic_noise,
+    straight_through,
+)
 from lidargrit.training.engine import Engine
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

@@ -13,11 +13,11 @@ from lidargrit.cli import main
 from lidargrit.core import discovery
 from lidargrit.core.errors import DataError, LidarGritError, UnknownNameError
 from lidargrit.core.files import write_json
+from lidargrit.core.table import render
 from lidargrit.data.images import Pixels, Provenance
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_source
-from lidargrit.evaluation.command import read_config
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources, read_config
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import pair_for_protocol
@@ -154,7 +154,7 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
     line = next(line for line in card.as_table().splitlines() if line.startswith("left out:"))
     assert "frechet_pointcloud_distance: got" in line
     write_json(tmp_path / "mine.json", card.to_json())
-    assert "mine: left out: frechet_pointcloud_distance" in side_by_side([tmp_path / "mine.json"])
+    assert "mine: left out: frechet_pointcloud_distance" in render(side_by_side([tmp_path / "mine.json"]))
     with pytest.raises(LidarGritError, match=r"none\.pth"):
         compare_sources(*sets, replace(settings, metrics=("frechet_pointcloud_distance",)))
 
@@ -302,7 +302,7 @@ def test_published_figures_stand_apart_and_only_beside_their_equals(card, tmp_pa
     paths = [tmp_path / f"{name}.json" for name in ("ours", "theirs", "elsewhere")]
     write_json(paths[0], as_if(card, "lidargrit_kitti_odometry").to_json())
     write_json(paths[1], as_if(card, "lidargrit_kitti_odometry").to_json())
-    text = side_by_side(paths[:2])
+    text = render(side_by_side(paths[:2]))
     measured, differences, *tables = text.split("\n\n")
     assert "ours" in measured
     assert "theirs" in measured
@@ -314,25 +314,25 @@ def test_published_figures_stand_apart_and_only_beside_their_equals(card, tmp_pa
     # Another reference stands in a block of its own, and what is not the protocol gets no published scores.
     deviant = as_if(card, "lidargrit_kitti_odometry", ("the reference is simulated, not kitti_odometry",), "cd" * 32)
     write_json(paths[2], deviant.to_json())
-    text = side_by_side([paths[2]])
+    text = render(side_by_side([paths[2]]))
     assert "DUSty" not in text
     assert "left out, for they do not compare: the reference is simulated" in text
-    assert side_by_side(paths).count("Measured, protocol") == 2
+    assert render(side_by_side(paths)).count("Measured, protocol") == 2
     write_json(paths[0], card.to_json())
-    assert "ublished" not in side_by_side(paths[:1])
+    assert "ublished" not in render(side_by_side(paths[:1]))
 
 
 def test_tables_can_be_set_in_markdown_and_latex(card, tmp_path):
     path = tmp_path / "100%_of|it.json"
     write_json(path, as_if(card, "lidargrit_kitti_odometry").to_json())
-    markdown = side_by_side([path], "markdown")
+    markdown = render(side_by_side([path]), "markdown")
     assert r"100%\_of\|it" in markdown
     assert "| --- |" in markdown
-    latex = side_by_side([path], "latex")
+    latex = render(side_by_side([path]), "latex")
     assert r"100\%\_of|it" in latex
     assert latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == 3
     with pytest.raises(DataError, match="no file of scores"):
-        side_by_side([])
+        render(side_by_side([]))
 
 
 def test_published_tables_are_whole():

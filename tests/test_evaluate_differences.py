@@ -8,6 +8,7 @@ import pytest
 
 from lidargrit.core.errors import DataError, ScanError
 from lidargrit.core.files import write_json
+from lidargrit.core.table import render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
@@ -58,7 +59,7 @@ def test_other_definitions_are_told_and_have_no_published_scores_beside_them(tmp
         settings = EvalConfig("lidargrit-kitti-odometry", resampling=PLAIN, **settings)
         card = compare_pair(as_wanted(), settings)
         write_json(tmp_path / "ours.json", card.to_json())
-        return card.deviations, side_by_side([tmp_path / "ours.json"])
+        return card.deviations, render(side_by_side([tmp_path / "ours.json"]))
 
     told, table = scored(metrics=("sliced_wasserstein", "return_rate_per_ring"))
     assert told == (), "a metric that the protocol does not have changes none of its own"
@@ -101,4 +102,4 @@ def test_errors_of_reconstruction_are_no_row_of_a_table(tmp_path):
     path = tmp_path / "run.json"
     path.write_text(json.dumps({"samples": "runs/mine", "reference": "x", "reconstruction": {"range_mae_m": 1.0}}))
     with pytest.raises(DataError, match=r"holds errors of reconstruction; wanted scores of samples.*lidargrit sample"):
-        side_by_side([path])
+        render(side_by_side([path]))

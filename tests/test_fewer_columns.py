@@ -3,9 +3,9 @@
 import numpy as np
 
 from lidargrit.data.images import Pixels, Provenance
-from lidargrit.data.prepared.columns import FewerColumns
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
+from lidargrit.data.prepared.prepared import FewerColumns
 from lidargrit.data.sources import open_source
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.scans.sensors import load_sensor

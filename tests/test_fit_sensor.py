@@ -13,10 +13,9 @@ from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.scans.fit_sensor import SensorFit, fit_sensor, fit_sensor_to_dataset
+from lidargrit.scans.fit_sensor import SensorFit, farthest_m, fit_sensor, fit_sensor_to_dataset, quantum_m
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans
 from lidargrit.scans.fit_sensor.elevations import nearest_row, rows_of_rings
-from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
 from lidargrit.scans.fit_sensor.table import as_table
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.scans.types import Scan

@@ -9,8 +9,7 @@ import torch
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.nn.flops import flops_of
-from lidargrit.systems.r2flow.hdit import Hdit, HditConfig
-from lidargrit.systems.r2flow.neighbourhood import neighbourhood_attention
+from lidargrit.systems.r2flow.hdit import Hdit, HditConfig, neighbourhood_attention
 from reference_weights import seeded_weights
 
 SIZES = {"tiny": HditConfig(16, 24, (2, 1, 1, 2), (1, 2, 2, 4)), "wide": HditConfig()}

@@ -24,9 +24,9 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.hints import hints_of
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion.objective import CompletionObjective
+from lidargrit.systems.completion.system import CompletionObjective
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
-from lidargrit.systems.raydrop.objective import RaydropObjective
+from lidargrit.systems.raydrop.system import RaydropObjective
 from tiny_runs import every_fourth_row, learn, save_bundle
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

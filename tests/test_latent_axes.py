@@ -9,8 +9,7 @@ import torch
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.scans.example import Example
-from lidargrit.systems.lidm.latent_axes import LatentAxes
-from lidargrit.systems.lidm.system import Lidm, LidmConfig
+from lidargrit.systems.lidm.system import LatentAxes, Lidm, LidmConfig
 from test_lidm import SENSOR, SMALL, made, walls
 
 CONFIG = LidmConfig(VqvaeConfig(32, (1, 1, 1), code_dim=8, num_codes=32), SMALL.denoiser, latent_axes=2)

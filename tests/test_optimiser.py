@@ -20,8 +20,7 @@ from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
-from lidargrit.training.muon import Muon
-from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
+from lidargrit.training.optimiser import Muon, WeightAverage, learning_rate_at, make_optimiser
 
 
 def config(**settings):
@@ -71,7 +70,9 @@ def muon_step(optimiser, model, seed):
 
 
 def test_muon_moves_the_matrices_of_blocks_and_adamw_all_else(monkeypatch):
-    monkeypatch.setattr("lidargrit.training.muon.dtype_of", lambda _precision: torch.bfloat16)  # as torch always does
+    monkeypatch.setattr(
+        "lidargrit.training.optimiser.dtype_of", lambda _precision: torch.bfloat16
+    )  # as torch always does
     ours, theirs = small_transformer(), small_transformer()
     matrices = [p for name, p in theirs.named_parameters() if name.startswith("blocks.") and p.ndim == 2]
     others = [p for name, p in theirs.named_parameters() if not (name.startswith("blocks.") and p.ndim == 2)]
@@ -116,7 +117,7 @@ def test_muon_takes_the_kernels_of_blocks_as_matrices_of_one_row_a_channel(layou
 
 @pytest.mark.parametrize("shape", [(3, 7), (7, 3), (5, 5)])
 def test_a_step_of_muon_is_that_of_a_loop_over_singular_values(shape, monkeypatch):
-    monkeypatch.setattr("lidargrit.training.muon.dtype_of", lambda _precision: torch.float32)
+    monkeypatch.setattr("lidargrit.training.optimiser.dtype_of", lambda _precision: torch.float32)
     rng = np.random.default_rng(0)
     start, gradients = rng.normal(size=shape), rng.normal(size=(3, *shape))
     weight, wanted, average = nn.Parameter(torch.tensor(start).float()), start.copy(), np.zeros(shape)

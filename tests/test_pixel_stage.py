@@ -15,7 +15,7 @@ from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
-from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.likelihood import _maps
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.batches import in_batches

@@ -7,11 +7,11 @@ import torch
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
-from lidargrit.evaluation import pixel_statistics as module
+from lidargrit.evaluation import scoring as module
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
-from lidargrit.evaluation.pixel_statistics import pixel_statistics
+from lidargrit.evaluation.scoring import pixel_statistics
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 

@@ -19,7 +19,7 @@ from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.presets import load_preset
 from lidargrit.inference.segment import open_segmenter
-from lidargrit.inference.segment.scores import LabelScores
+from lidargrit.inference.segment.command import LabelScores
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.compute import uniform_images

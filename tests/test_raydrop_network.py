@@ -18,7 +18,7 @@ from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
-from lidargrit.systems.raydrop.objective import RaydropObjective
+from lidargrit.systems.raydrop.system import RaydropObjective
 from tiny_runs import learn, save_bundle
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)

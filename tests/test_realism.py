@@ -14,7 +14,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation import realism
 from lidargrit.evaluation.metrics import load_metric
-from lidargrit.evaluation.realism import CURVES, SimulatedScans, as_table, compare, drop_independently, simulate_pair
+from lidargrit.evaluation.realism import CURVES, SimulatedScans, compare, drop_independently, simulate_pair, tables
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit
@@ -77,15 +77,15 @@ def test_independent_drops_keep_a_share_whatever_it_meets(simulated):
 def test_scans_are_nearer_to_the_simulator_that_made_them_than_to_independent_drops(simulated, recorded, scores):
     """The two differ only by the projection and by the halves of the scans that real against real compares."""
     assert recorded.batch([0]).return_mask.sum() > 0
-    named = {score.simulated.metric: score for score in scores}
+    named = {score.own.metric: score for score in scores}
     assert set(CURVES) - {"reflectance_histogram"} <= set(named) <= set(CURVES)
     for score in scores:
-        assert score.simulated.value < 0.02
-        assert score.simulated.value < score.bernoulli.value
-        assert score.real_against_real.value > score.simulated.value
-        assert score.ratio == score.simulated.value / score.bernoulli.value
+        assert score.own.value < 0.02
+        assert score.own.value < score.bernoulli.value
+        assert score.real_against_real.value > score.own.value
+        assert score.ratio == score.own.value / score.bernoulli.value
         assert (
-            score.simulated.num_generated,
+            score.own.num_generated,
             score.real_against_real.num_generated,
             score.real_against_real.num_reference,
         ) == (3, 1, 2)
@@ -97,15 +97,15 @@ def test_distances_are_those_of_the_metrics(simulated, recorded, scores):
     metric = load_metric("drop_run_lengths")()
     metric.update(independent, real=False)
     metric.update(real, real=True)
-    score = next(score for score in scores if score.simulated.metric == "drop_run_lengths")
+    score = next(score for score in scores if score.own.metric == "drop_run_lengths")
     assert np.isclose(score.bernoulli.value, metric.compute().value)
 
 
 def test_the_table_names_every_curve(scores):
-    lines = as_table(scores).splitlines()
+    lines = tables(scores)[0].as_text().splitlines()
     assert lines[1].split()[:2] == ["scans", "compared"]
     assert lines[1].count(" v ") == 2
-    assert [line.split()[0] for line in lines[2:]] == [score.simulated.metric for score in scores]
+    assert [line.split()[0] for line in lines[2:]] == [score.own.metric for score in scores]
 
 
 def test_one_scan_and_other_rays_are_refused(simulated, recorded):
@@ -139,9 +139,9 @@ def test_only_views_from_above_are_plotted_as_maps(rows, tmp_path, monkeypatch):
     scores = compare(
         simulated, load_range_images((f"simulated:2@{sensor.name}",), DataConfig(sensor=sensor.name)), CURVES
     )
-    plot_curves([score for score in scores if score.simulated.metric != "bev_occupancy"], tmp_path / "none.png")
+    plot_curves([score for score in scores if score.own.metric != "bev_occupancy"], tmp_path / "none.png")
     assert not labels
-    plot_curves([score for score in scores if score.simulated.metric == "bev_occupancy"], tmp_path / "maps.png")
+    plot_curves([score for score in scores if score.own.metric == "bev_occupancy"], tmp_path / "maps.png")
     assert len(labels) == 3
 
 

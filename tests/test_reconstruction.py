@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ConfigError, DataError, ScanError
-from lidargrit.evaluation import reconstruction
-from lidargrit.evaluation.reconstruction import ReconstructionScore
+from lidargrit.evaluation.reconstruction import ReconstructionScore, errors_of_scans
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 
@@ -35,22 +34,20 @@ def test_errors_and_accuracies_are_the_programs(golden):
     data = golden("misc")
     real, decoded = (torch.from_numpy(data[key][:, 0]) for key in ("depth_ref", "depth_gen"))
     mask = torch.from_numpy(data["depth_mask"][:, 0] > 0)
-    for name in ("abs_rel", "sq_rel", "rmse", "rmse_log"):
-        ours = getattr(reconstruction, name)(real, decoded, mask)
-        assert np.allclose(ours.numpy(), data[f"err_{name}"], rtol=1e-5)
-    for power in (1, 2, 3):
-        ours = reconstruction.accuracy(real, decoded, mask, power)
-        assert np.allclose(ours.numpy(), data[f"acc_accuracy_{power}"], rtol=1e-6)
+    ours = errors_of_scans(real, decoded, mask)
+    theirs = {"abs_rel": "abs_rel", "sq_rel_m": "sq_rel", "scan_rmse_m": "rmse", "rmse_log": "rmse_log"}
+    for name, their_name in theirs.items():
+        assert np.allclose(ours[name].numpy(), data[f"err_{their_name}"], rtol=1e-5)
+    assert np.allclose(ours["accuracy_1_25"].numpy(), data["acc_accuracy_1"], rtol=1e-6)
 
 
 def test_pixels_without_a_return_have_no_say_in_the_measures_of_an_image():
     real = torch.tensor([[[2.0, 0.0, 4.0]], [[0.0, 0.0, 0.0]]])
     decoded = torch.tensor([[[3.0, 0.0, 4.0]], [[1.0, 2.0, 3.0]]])
-    expected = {"abs_rel": 0.25, "sq_rel": 0.25, "rmse": 0.5**0.5, "rmse_log": math.log(1.5) / 2**0.5, "accuracy": 0.5}
-    for name, value in expected.items():
-        ours = getattr(reconstruction, name)(real, decoded, real > 0)
-        assert ours[0].item() == pytest.approx(value)
-        assert ours[1].isnan()
+    found = errors_of_scans(real, decoded, real > 0)
+    expected = [0.25, 0.25, 0.5**0.5, math.log(1.5) / 2**0.5, 0.5]
+    assert [each[0].item() for each in found.values()] == pytest.approx(expected)
+    assert all(each[1].isnan() for each in found.values())
 
 
 def test_score_is_that_of_a_slow_loop():
@@ -94,16 +91,11 @@ def test_a_perfect_decoder():
     assert errors.mask_accuracy == errors.drop_precision == errors.drop_recall == errors.drop_iou == 1
 
 
-def test_pieces_order_and_processes_do_not_matter():
+def test_pieces_and_their_order_do_not_matter():
     real, clean_range_m, return_mask = pairs(0)
     batches = [(real[s], clean_range_m[s], return_mask[s]) for s in (slice(3, 5), slice(0, 1), slice(1, 3))]
     once = errors_of((real, clean_range_m, return_mask))
-    parts = [ReconstructionScore(), ReconstructionScore()]
-    for batch, part in zip(batches, (0, 1, 1), strict=True):
-        parts[part].update(*batch)
-    parts[0].merge(parts[1])
-    for other in (errors_of(*batches), parts[0].compute()):
-        assert vars(other) == pytest.approx(vars(once), rel=1e-12)
+    assert vars(errors_of(*batches)) == pytest.approx(vars(once), rel=1e-12)
 
 
 def test_what_the_decoder_says_of_dropped_rays_does_not_change_the_range_errors():

@@ -24,12 +24,10 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.completion.hints import hints_of
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
-from lidargrit.systems.completion.objective import CompletionObjective, random_patterns
-from lidargrit.systems.completion.system import Completion, CompletionConfig
+from lidargrit.systems.completion.system import Completion, CompletionConfig, CompletionObjective, random_patterns
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
-from lidargrit.systems.raydrop.objective import RaydropObjective
-from lidargrit.systems.raydrop.system import Raydrop, RaydropConfig
+from lidargrit.systems.raydrop.system import Raydrop, RaydropConfig, RaydropObjective
 from lidargrit.training.taken_stages import taken_stages
 from tiny_runs import every_fourth_row, learn, save_bundle, the_one_line
 

@@ -8,6 +8,7 @@ import pytest
 from lidargrit.cli import _results, main
 from lidargrit.core.errors import OutputError
 from lidargrit.core.files import write_json
+from lidargrit.core.table import render
 from lidargrit.evaluation.tables import side_by_side
 from test_verdict import card, score
 
@@ -47,6 +48,6 @@ def test_the_file_is_written_though_nobody_reads_the_table(monkeypatch, tmp_path
 
 def test_a_foreign_name_reaches_no_terminal_as_code(tmp_path):
     write_json(tmp_path / "theirs.json", card(score(0.5, metric="bev\x1b[31m")).to_json())
-    table = side_by_side([tmp_path / "theirs.json"])
+    table = render(side_by_side([tmp_path / "theirs.json"]))
     assert "\x1b" not in table
     assert "bev\\x1b[31m" in table

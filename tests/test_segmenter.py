@@ -13,8 +13,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.scan_folder import KittiTree
 from lidargrit.evaluation.metrics.shared.labelled import segmenter_of
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
-from lidargrit.inference.segment.points import labels_of_points
-from lidargrit.inference.segment.scores import GROUPS, LabelScores
+from lidargrit.inference.segment.command import GROUPS, LabelScores, labels_of_points
 from lidargrit.scans.classes import CLASSES
 from lidargrit.scans.example import Example
 from lidargrit.scans.projection import index_map, project
@@ -22,9 +21,7 @@ from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import simulate
-from lidargrit.systems.segmenter.network import SegmenterNetworkConfig
-from lidargrit.systems.segmenter.objective import SegmenterObjective
-from lidargrit.systems.segmenter.system import Segmenter, SegmenterConfig
+from lidargrit.systems.segmenter.system import Segmenter, SegmenterConfig, SegmenterNetworkConfig, SegmenterObjective
 from tiny_runs import learn, the_one_line
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)

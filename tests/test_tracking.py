@@ -7,7 +7,7 @@ import pytest
 
 from lidargrit.cli import main
 from lidargrit.generation.presets import load_preset
-from lidargrit.training.tracking import tracked
+from lidargrit.training.run import tracked
 from tiny_runs import the_one_line, train_words
 
 PRESET = load_preset("lidargrit_demo")

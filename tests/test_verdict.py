@@ -13,16 +13,15 @@ from scipy.stats import t as student
 from lidargrit.cli import main
 from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_json, write_json
-from lidargrit.evaluation import sight
-from lidargrit.evaluation.differences import compare_systems
+from lidargrit.core.table import render
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score, around
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.scorecard import EvalSetRecord, LeftOut, Scorecard
-from lidargrit.evaluation.tables import judge, share_pixel_statistics, side_by_side
-from lidargrit.evaluation.verdict import ENOUGH, notes_on_floors, tells_apart, verdict
+from lidargrit.evaluation.tables import compare_systems, judge, share_pixel_statistics, side_by_side
+from lidargrit.evaluation.verdict import ENOUGH, _measured, blind_to, notes_on_floors, tells_apart, verdict
 from lidargrit.publishing.card import _scores
 from lidargrit.scans.types import MetricResult
-from lidargrit.viewer.score_table import score_table
+from lidargrit.viewer.report_charts import score_table
 from lidargrit.viewer.table_page import table_page
 
 FACTS = EvalSetRecord("a", "samples", "", 200, 200, "s 8x8", "spherical, exact", "ab" * 32)
@@ -47,7 +46,8 @@ def said(*scores, **more):
 
 @pytest.fixture(autouse=True)
 def every_metric_sees_objects(monkeypatch):
-    monkeypatch.setattr(sight, "blind_to", lambda metric, variant, scans: () if metric != "coverage" else ("boxes",))
+    unseen = {"coverage": ("boxes",)}
+    monkeypatch.setattr("lidargrit.evaluation.verdict.blind_to", lambda metric, *_: unseen.get(metric, ()))
 
 
 def test_a_metric_that_would_not_have_seen_damaged_objects_is_not_within_noise():
@@ -77,26 +77,26 @@ def test_a_damage_that_was_seen_with_fewer_scans_is_seen_with_more(monkeypatch):
         ]
     ]
     monkeypatch.undo()
-    monkeypatch.setattr(sight, "_rows", lambda: iter(rows))
-    sight._measured.cache_clear()
-    assert sight.blind_to("m", "v", 299) == ("blur", "gone")
-    assert sight.blind_to("m", "v", 300) == ("gone",)
-    assert sight.blind_to("m", "v", 99) == ("blur", "boxes", "gone")
-    assert sight.blind_to("m", "other", 300) is None
+    monkeypatch.setattr("lidargrit.evaluation.verdict._rows", lambda: iter(rows))
+    _measured.cache_clear()
+    assert blind_to("m", "v", 299) == ("blur", "gone")
+    assert blind_to("m", "v", 300) == ("gone",)
+    assert blind_to("m", "v", 99) == ("blur", "boxes", "gone")
+    assert blind_to("m", "other", 300) is None
     monkeypatch.undo()
-    sight._measured.cache_clear()
+    _measured.cache_clear()
 
 
 def test_every_measured_metric_has_every_damage_and_is_one_of_the_program(monkeypatch):
     monkeypatch.undo()
-    measured = sight._measured()
+    measured = _measured()
     damages = {tuple(sorted(each)) for each in measured.values()}
     assert len(damages) == 1
     assert len(damages.pop()) == 3
     for metric, variant in measured:
         assert variant in load_metric(metric).variants
-    assert "ranges blurred over 3 columns" not in sight.blind_to("object_statistics", "segmented", 100)
-    assert len(sight.blind_to("bev_jsd", "exact", 100)) == 3
+    assert "ranges blurred over 3 columns" not in blind_to("object_statistics", "segmented", 100)
+    assert len(blind_to("bev_jsd", "exact", 100)) == 3
 
 
 def test_all_scores_are_counted_and_losses_come_first():
@@ -237,7 +237,8 @@ def test_equal_sets_that_do_not_score_0_have_their_floor_beside_them(tmp_path):
     assert unknown.endswith("is not known here")
     told = card(*variants)
     write_json(tmp_path / "a.json", told.to_json())
-    places = (told.as_table(), side_by_side([tmp_path / "a.json"]), score_table(told), _scores(told).replace("\\", ""))
+    beside = render(side_by_side([tmp_path / "a.json"]))
+    places = (told.as_table(), beside, score_table(told), _scores(told).replace("\\", ""))
     page = table_page([{"system": "a", "costs": {}, "scores": read_json(tmp_path / "a.json")}], 0.0)
     assert [words[1] in text for text in (*places, page)] == [True] * 5
 
@@ -338,7 +339,7 @@ def test_terminal_page_and_card_tell_the_same(tmp_path):
         "memorised": card(score(0.1, 0.1)),
     }
     paths = written(tmp_path, files)
-    terminal = side_by_side(paths).splitlines()
+    terminal = render(side_by_side(paths)).splitlines()
     share_pixel_statistics(paths)
     cells = [{"system": path.stem, "costs": {}, "scores": read_json(path)} for path in paths]
     page = html.unescape(re.sub("<[^>]+>", "\n", table_page(cells, 0.0))).splitlines()
@@ -356,14 +357,14 @@ def test_terminal_page_and_card_tell_the_same(tmp_path):
     }
     for place, text in told.items():
         assert all(sentence in text for sentence in mine.verdict.sentences), place
-    markdown, latex = (side_by_side(paths, form) for form in ("markdown", "latex"))
+    markdown, latex = (render(side_by_side(paths), form) for form in ("markdown", "latex"))
     assert "- mine: Against pixel statistics: worse" in markdown
     assert latex.splitlines()[1].startswith("% mine: Against pixel statistics: worse")
 
 
 def test_a_table_names_the_bounds_and_compares_none_of_them(tmp_path):
     files = {"marginal": card(score(0.9, 0.1)), "memorised": card(score(0.1, 0.1)), "mine": card(score(0.5, 0.1))}
-    table = side_by_side(written(tmp_path, files))
+    table = render(side_by_side(written(tmp_path, files)))
     assert table.splitlines()[1].startswith("mine: Against pixel statistics: worse in 0 of 1 scores, better in 1")
     assert "marginal (pixel statistics)" in table
     assert "memorised (memorised training scans)" in table

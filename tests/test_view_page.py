@@ -108,7 +108,8 @@ def test_pages_of_nothing_and_of_too_much(shown, tmp_path):
 
 
 def test_scripts_stay_short():
-    files = sorted((Path(interactive.__file__).parent / "browser").iterdir())
+    folder = Path(interactive.__file__).parent
+    files = sorted(path for part in ("browser", "templates") for path in (folder / part).iterdir())
     assert {path.suffix for path in files} == {".js", ".css", ".html"}
     for path in files:
         assert path.read_text(encoding="utf-8").count("\n") <= 400, path.name

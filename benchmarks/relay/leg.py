@@ -15,11 +15,11 @@ from typing import Any
 import torch
 from packing import RELAY_FILE, round_finished
 from streets import Streets, ValidationStreets, simulating
+from upright_objects import kept_objects
 
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import OutputError, Terminated
 from lidargrit.core.files import read_json, write_json
-from lidargrit.evaluation.upright_objects import kept_objects
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
 from lidargrit.generation.presets import load_preset

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
-from lidargrit.cli._parser import EXIT_CODES, HelpFormatter, Parser
-from lidargrit.cli._shell import SHELLS, script
+from lidargrit.cli._parser import EXIT_CODES, SHELLS, HelpFormatter, Parser, script
 from lidargrit.cli._signals import raising_on_signals
 from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import LidarGritError, Terminated, UsageError

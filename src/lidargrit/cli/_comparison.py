@@ -1,6 +1,7 @@
 """Options of ``compare`` → one of three tables: systems by a protocol, a table of the paper, completions."""
 
 import argparse
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings, scan_words
@@ -21,7 +22,7 @@ DEFAULTS: dict[str, Any] = {
 """Settings that all systems share where the user gives none; a table that is extended keeps its own."""
 _OF_SYSTEMS = ("systems", "add", "workers", "table", *DEFAULTS, *SCANS)
 _OF_PAPER = ("paper_table", "data", "small", "count", "flops", "table", "workers", "dry_run", *SCANS)
-_OF_COMPLETION = ("systems", "protocol", "reference", "count", "observed", "samples", "seed", "device", *SCANS)
+_OF_COMPLETION = ("systems", "protocol", "reference", "count", "observed", "samples", "seed", "device", "table", *SCANS)
 
 
 def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
@@ -101,9 +102,10 @@ def _paper_table(options: argparse.Namespace) -> "Reproduction | None":
 def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Hide parts of whole scans, have every model fill them in, and return the table and its plain values."""
     from lidargrit.core.files import refuse_to_overwrite, write_json
+    from lidargrit.core.table import render
     from lidargrit.data.sources import open_source
     from lidargrit.data.sources.scan_sensor import sensor_for
-    from lidargrit.evaluation.completion import PATTERNS, as_json, as_table, compare_completion
+    from lidargrit.evaluation.completion import PATTERNS, compare_completion, tables
     from lidargrit.inference.complete import is_classical, open_models
     from lidargrit.inference.complete.inputs import images_for
     from lidargrit.inference.complete.patterns import Pattern
@@ -121,6 +123,6 @@ def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     models = open_models(words, sensor, options.device)
     images = images_for(models, scans, settings)
     scores = compare_completion(images, models, patterns, options.samples, options.seed)
-    found = {"reference": scans, "scores": as_json(scores)}
+    found = {"reference": scans, "scores": [asdict(score) for score in scores]}
     write_json(file, found)
-    return as_table(scores), found
+    return render(tables(scores), options.table), found

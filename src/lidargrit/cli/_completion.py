@@ -13,7 +13,7 @@ from lidargrit.core.untrusted import seed_number, whole_number
 if TYPE_CHECKING:
     from lidargrit.data.run_folder import Job
     from lidargrit.inference.complete import Model
-    from lidargrit.inference.complete.command import Written
+    from lidargrit.inference.complete.files import Written
     from lidargrit.inference.complete.tasks import Task
     from lidargrit.scans.sensors import SensorModel
 
@@ -72,8 +72,7 @@ def named_sensor(options: argparse.Namespace, is_needed: bool, job: "Job" = "com
 
 def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:
     """Do a task with every scan, and say how many points came in and went out, and how to look at them."""
-    from lidargrit.inference.complete.command import complete_scans
-    from lidargrit.inference.complete.files import OutputConfig
+    from lidargrit.inference.complete.files import OutputConfig, complete_scans
 
     output = OutputConfig(options.samples, options.seed, options.format, probability)
     config = scan_settings(options, max_scans=options.count).data

@@ -15,7 +15,8 @@ _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups"
 def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
     """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.evaluation.command import evaluate, evaluate_streets, read_config, streets_of
+    from lidargrit.evaluation.comparison import compare_sources, read_config
+    from lidargrit.evaluation.raydrop import evaluate_streets, streets_of
     from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
@@ -31,7 +32,10 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     streets = streets_of(options.samples, config) if options.reference else None
     if streets is None:
         refuse_unused(options, "without --tables or --protocol streets", (*_OF_BOTH, *_OF_CARDS))
-        return evaluate(*sets, config, options.report, write_report, options.overwrite)
+        refuse_to_overwrite(options.report, options.overwrite, ".html")
+        card, pair = compare_sources(*sets, config)
+        report = partial(write_report, card, pair, options.report) if options.report else None
+        return card.as_table(), card.to_json(), report
     refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model"))
     refuse_to_overwrite(options.report, options.overwrite, ".png")
     text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model)

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, NoReturn
 
+from lidargrit.cli._catalogue import entries
 from lidargrit.core.errors import UsageError, nearest_names, one_of
 from lidargrit.core.untrusted import check_path, check_word, positive_number, whole_number
 
@@ -21,6 +22,8 @@ _EXPLANATIONS = (
     (re.compile(r"expected (?:one|at least one) argument"), "nothing after {name}", "a value", "write one behind it"),
     (re.compile(r"ignored explicit argument (.*)"), "{name} with {0}", "{name} alone", "leave the value out"),
 )
+SHELLS = ("bash", "zsh", "fish")
+_KINDS = {"preset": "presets", "sensor": "sensors", "to": "sensors", "protocol": "protocols", "metrics": "metrics"}
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -141,3 +144,16 @@ class Parser(argparse.ArgumentParser):
 
     def _help(self) -> str:
         return f"see: {self.prog} --help"
+
+
+def script(parser: Parser, shell: str) -> str:
+    """Return the script of one shell; its verbs' names of presets, sensors, protocols and metrics are completed too."""
+    import shtab
+
+    for verb in parser.verbs():
+        for action in verb._actions:
+            if action.dest in _KINDS:
+                action.choices = [entry["name"] for entry in entries(_KINDS[action.dest])]
+            elif action.choices is None and action.nargs != 0 and action.type not in (int, float):  # then a place
+                action.complete = shtab.FILE  # pyright: ignore[reportAttributeAccessIssue]  shtab looks for it there
+    return shtab.complete(parser, shell)

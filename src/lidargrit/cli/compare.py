@@ -18,7 +18,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
@@ -48,6 +47,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compare, write the table, and print it."""
     refuse_taken(options, options.out / "table.json", options.out / COMPLETED)
     print_result(options, *compared(options))

@@ -13,7 +13,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     observed = "what is kept: returns, rows:N (every N-th), sector:A,B (degrees from A counter-clockwise to B, 0 is "
     observed += "ahead), pixels:SHARE (a random share), or an .npy of truth values, one for each pixel"
     parser.add_argument("--observed", default="returns", help=observed)
@@ -21,7 +20,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Complete the scans, and say where they are."""
     from lidargrit.inference.complete import is_classical
     from lidargrit.inference.complete.patterns import Pattern
     from lidargrit.inference.complete.tasks import Fill

@@ -14,7 +14,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
@@ -27,7 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compress the scans, and say how small they are."""
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.inference.compress.command import compress_scans

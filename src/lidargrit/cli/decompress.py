@@ -15,7 +15,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("file", type=Path, metavar="FILE.lgz", help="file that lidargrit compress wrote")
@@ -28,7 +27,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Restore the scans."""
     from lidargrit.inference.compress.command import decompress_scans
 
     named = (options.file, options.out, options.model, options.format, options.only)

@@ -13,7 +13,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("--data", metavar="SOURCE", help="folder of scans (default: simulated scans)")
     parser.add_argument("--out", type=Path, help="run folder (default: runs/demo, or runs/demo-FOLDER)")
@@ -24,7 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Run the demo and say where its results lie."""
     from lidargrit.data.datasets import root_of
     from lidargrit.viewer.demo import PAGE, demo
 

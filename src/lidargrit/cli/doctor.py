@@ -11,12 +11,10 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print facts that matter to a bug report or before a long run."""
     import os
     import platform
     import shutil

@@ -18,7 +18,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     add = parser.add_argument
     samples = "samples of lidargrit or of another program (.pth), or a source of scans"
     add("samples", nargs="?", default="", help=samples)
@@ -43,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Score and print a table."""
     refuse_taken(options)
     text, values, also = evaluated(options)
     print_result(options, text, values, files_told(scores=options.json, report=options.report), also)

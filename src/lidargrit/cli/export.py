@@ -16,16 +16,13 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("scans", help="samples, prepared scans, or scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
-    parser.add_argument(
-        "--format",
-        default="kitti_bin",
-        help="format of the files: bin, pcd, ply, las, npz, a name from: lidargrit list formats, or kitti_odometry for "
-        "a tree with SemanticKITTI's labels",
+    formats = (
+        "format of the files: bin, pcd, ply, las, npz, a name from: lidargrit list formats, or kitti_odometry for "
     )
+    parser.add_argument("--format", default="kitti_bin", help=formats + "for a tree with SemanticKITTI's labels")
     add_count(parser)
     sensor = "name or .json file of the sensor, for range images in .npy files"
     parser.add_argument("--sensor", default="", help=sensor)
@@ -35,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write the files, and say how many."""
     from lidargrit.data.export import export_scans
     from lidargrit.data.trajectories import read_trajectory
     from lidargrit.scans.motion import UndoMotion

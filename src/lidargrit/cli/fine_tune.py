@@ -12,7 +12,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("scans", help="scans to learn from: a folder, or NAME:ROOT:SPLIT")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
@@ -22,7 +21,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Tell the time, then train."""
     from lidargrit.core import reporting
     from lidargrit.training import check_folder, measure, plan_training, train
     from lidargrit.training.compute import duration

@@ -14,7 +14,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.add_argument("scans", help="folder, data set or file of scans that one sensor made")
     parser.add_argument("-o", "--out", type=Path, default=Path("my_sensor.json"), help="sensor file to write")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also plot the fitted rows beside the points")
@@ -25,7 +24,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """StageTraining, print a table, write the sensor file and perhaps a picture."""
     from lidargrit.core.files import refuse_to_overwrite, write_json
     from lidargrit.data.sources import open_source
     from lidargrit.scans.fit_sensor import fit_sensor_to_dataset

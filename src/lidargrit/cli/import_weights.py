@@ -19,24 +19,16 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
-    parser.add_argument(
-        "preset", help="preset with the generator, sizes and sensor of the weights; see: lidargrit list presets"
-    )
-    parser.add_argument("out", type=Path, help="run folder to write, for: lidargrit sample, evaluate and view")
-    parser.add_argument(
-        "files",
-        type=Path,
-        nargs="+",
-        metavar="FILE",
-        help="published weight files; for lidargrit the VQ-VAE's first, then the transformer's",
-    )
-    settings = "settings of the preset to change"
-    add_settings(parser, settings)
+    add = parser.add_argument
+    preset = "preset with the generator, sizes and sensor of the weights; see: lidargrit list presets"
+    add("preset", help=preset)
+    add("out", type=Path, help="run folder to write, for: lidargrit sample, evaluate and view")
+    files = "published weight files; for lidargrit the VQ-VAE's first, then the transformer's"
+    add("files", type=Path, nargs="+", metavar="FILE", help=files)
+    add_settings(parser, "settings of the preset to change")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Import, and say what was found."""
     from lidargrit.publishing import import_weights
 
     generator = import_weights(options.preset, options.out, options.files, options.set)

@@ -14,7 +14,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.add_argument("scans", help="file of a scan, or a source of scans whose first scan is inspected")
     add_scans(parser)
     parser.add_argument("-o", "--out", type=Path, metavar="PNG", help="also plot the range image and what is lost")
@@ -22,10 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Project one scan and print what became of it."""
     from lidargrit.core import reporting
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.sources.first_scan import first_scan
+    from lidargrit.data.sources.named import first_scan
     from lidargrit.scans.projection.inspection import as_json, as_table, inspect
     from lidargrit.scans.projection.sensor_check import closest_sensor, projection_that_fits
     from lidargrit.scans.sensors import load_sensor

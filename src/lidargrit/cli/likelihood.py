@@ -14,25 +14,19 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     add = parser.add_argument
     add("scans", help="source of scans: a file's folder, NAME:ROOT:SPLIT, samples, or prepared scans")
     add("--model", default="pretrained", help="run whose probabilities count (default: pretrained)")
     add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
     add_count(parser)
-    add(
-        "--map",
-        type=Path,
-        metavar="FILE.npy",
-        help="also write the bits of every pixel: float32 (scans, rows, columns)",
-    )
+    bits = "also write the bits of every pixel: float32 (scans, rows, columns)"
+    add("--map", type=Path, metavar="FILE.npy", help=bits)
     add_scans(parser)
     add_device(parser)
     add_json(parser, "the files of --json and --map")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Measure, and print the tables."""
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.evaluation.likelihood import measure_source

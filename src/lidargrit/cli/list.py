@@ -14,13 +14,11 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.add_argument("kind", nargs="?", choices=KINDS, help="list one kind only, with all that is known of it")
     add_json(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print every name with its summary; of one kind, all facts of each name."""
     from lidargrit.cli._catalogue import entries, lines
 
     refuse_taken(options)

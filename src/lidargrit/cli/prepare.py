@@ -16,7 +16,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("scans", help="scans: a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     out = "folder for the range images, a source for train and evaluate (default: in the cache)"
@@ -30,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Prepare, and say what was made."""
     from lidargrit.data.prepared.prepare import prepare_and_describe
     from lidargrit.data.sources import open_source
 

@@ -11,30 +11,18 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
-    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a finished run")
-    parser.add_argument("out", type=Path, help="folder for the weights, their configuration and the model card")
-    parser.add_argument(
-        "--scores",
-        type=Path,
-        metavar="JSON",
-        help="scores of the run's samples for the card, written by: lidargrit evaluate --json",
-    )
-    parser.add_argument(
-        "--notes", type=Path, metavar="MD", help="Markdown file for the end of the card, such as known failures"
-    )
-    parser.add_argument(
-        "--bits",
-        type=int,
-        choices=(8, 16, 32),
-        default=32,
-        help="bits of a stored weight; networks compute in 32 bits whatever it is (default: %(default)s)",
-    )
+    add = parser.add_argument
+    add("run_folder", type=Path, metavar="RUN", help="folder of a finished run")
+    add("out", type=Path, help="folder for the weights, their configuration and the model card")
+    scores = "scores of the run's samples for the card, written by: lidargrit evaluate --json"
+    add("--scores", type=Path, metavar="JSON", help=scores)
+    add("--notes", type=Path, metavar="MD", help="Markdown file for the end of the card, such as known failures")
+    bits = "bits of a stored weight; networks compute in 32 bits whatever it is (default: %(default)s)"
+    add("--bits", type=int, choices=(8, 16, 32), default=32, help=bits)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write the folder."""
     from lidargrit.core.files import read_text
     from lidargrit.publishing import publish
 

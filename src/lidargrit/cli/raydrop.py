@@ -12,14 +12,12 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     share = "also write NAME.probability.npy, the share of returns of each pixel over this many samples"
     parser.add_argument("--probability", type=int, default=0, metavar="SAMPLES", help=share)
     add_completion(parser, "run whose sensor's raydrop is wanted")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Drop points, and say where the scans are."""
     from lidargrit.inference.complete.tasks import Drop
 
     task = Drop()

@@ -15,7 +15,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT or simulated:COUNT")
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
@@ -29,7 +28,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Write the files, and say how many rays of the wanted sensor get a point."""
     from lidargrit.data.export import export_scans
     from lidargrit.data.sources import open_source
     from lidargrit.data.sources.scan_sensor import sensor_for

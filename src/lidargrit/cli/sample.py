@@ -20,7 +20,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="a finished run, pretrained or pretrained_wide")
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
@@ -32,7 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Sample to disk."""
     import torch
 
     from lidargrit.core.processes import rank_and_world_size

@@ -16,7 +16,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
@@ -31,7 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Label the scans, and say where they are."""
     from lidargrit.data.sources.scan_sensor import refuse_other_sensor
     from lidargrit.inference.segment.command import segment_scans
 

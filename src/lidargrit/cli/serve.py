@@ -15,25 +15,19 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
-    parser.add_argument(
-        "runs",
-        nargs="*",
-        type=Path,
-        metavar="RUN",
-        help="folders of finished runs (default: all in runs/, and the models in the package)",
-    )
-    others = "address to listen at; 0.0.0.0 lets other machines in (default: 127.0.0.1, this machine only)"
-    parser.add_argument("--host", default="127.0.0.1", help=others)
-    parser.add_argument("--port", type=int, default=8000, help="port to listen at; 0 for any free one")
-    parser.add_argument("--open", action="store_true", help="open the page in this machine's browser, too")
-    parser.add_argument("--seconds", type=float, default=120.0, help="time limit of one request, in seconds")
-    add_device(parser)
     parser.set_defaults(waits=True)
+    add = parser.add_argument
+    runs = "folders of finished runs (default: all in runs/, and the models in the package)"
+    add("runs", nargs="*", type=Path, metavar="RUN", help=runs)
+    host = "address to listen at; 0.0.0.0 lets other machines in (default: 127.0.0.1, this machine only)"
+    add("--host", default="127.0.0.1", help=host)
+    add("--port", type=int, default=8000, help="port to listen at; 0 for any free one")
+    add("--open", action="store_true", help="open the page in this machine's browser, too")
+    add("--seconds", type=float, default=120.0, help="time limit of one request, in seconds")
+    add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Serve until interrupted."""
     from lidargrit.data.run_folder import named_folder
     from lidargrit.viewer.serve import Limits, finished_runs, serve
 

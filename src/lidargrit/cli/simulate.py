@@ -16,42 +16,27 @@ _SENSOR = "hdl64e_kitti_odometry"  # of the data set whose layout is written
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
-    parser.add_argument("out", type=Path, help="folder for the scans: empty, or begun by the same command")
-    parser.add_argument("-n", "--count", type=int, required=True, help="number of scans in all")
-    parser.add_argument("--sensor", default=_SENSOR, help="name or .json file of the sensor")
-    parser.add_argument(
-        "--seed", type=seed_number, default=0, help="seed of the first street; each next street has the next seed"
-    )
-    parser.add_argument(
-        "--frames", type=int, default=1, help="scans of each street, 0.1 s apart; a street ends at 100 m"
-    )
-    parser.add_argument(
-        "--theme", choices=["mixed", "city", "suburb", "country"], default="mixed", help="kind of streets"
-    )
-    parser.add_argument("--motion", action="store_true", help="keep the distortion that the car's own motion causes")
-    parser.add_argument("--wet", type=float, default=0.0, help="wetness of the ground, from 0 (dry) to 1")
-    parser.add_argument(
-        "--clean", action="store_true", help="also write clean ranges and return probabilities, as .npz"
-    )
-    parser.add_argument("--workers", type=int, default=2, help="number of processes")
+    add = parser.add_argument
+    add("out", type=Path, help="folder for the scans: empty, or begun by the same command")
+    add("-n", "--count", type=int, required=True, help="number of scans in all")
+    add("--sensor", default=_SENSOR, help="name or .json file of the sensor")
+    seed = "seed of the first street; each next street has the next seed"
+    add("--seed", type=seed_number, default=0, help=seed)
+    add("--frames", type=int, default=1, help="scans of each street, 0.1 s apart; a street ends at 100 m")
+    add("--theme", choices=["mixed", "city", "suburb", "country"], default="mixed", help="kind of streets")
+    add("--motion", action="store_true", help="keep the distortion that the car's own motion causes")
+    add("--wet", type=float, default=0.0, help="wetness of the ground, from 0 (dry) to 1")
+    add("--clean", action="store_true", help="also write clean ranges and return probabilities, as .npz")
+    add("--workers", type=int, default=2, help="number of processes")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Simulate, and say where the files are."""
     from lidargrit.data.drives import DriveConfig, write_drives
     from lidargrit.scans.sensors import load_sensor
 
-    config = DriveConfig(
-        sensor=load_sensor(options.sensor),
-        seed=options.seed,
-        frames=options.frames,
-        theme=options.theme,
-        motion=options.motion,
-        wet=options.wet,
-        clean=options.clean,
-    )
+    settings = {name: vars(options)[name] for name in ("seed", "frames", "theme", "motion", "wet", "clean")}
+    config = DriveConfig(load_sensor(options.sensor), **settings)
     there = write_drives(options.out, options.count, config, options.workers)
     theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
     print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

@@ -15,7 +15,6 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.set_defaults(goes_on=True)
     parser.add_argument("preset", help="name of a preset; see: lidargrit list presets")
     parser.add_argument("out", type=Path, help="run folder to write; the same command continues there")
@@ -30,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Train, or print the plan."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.generation.generator import load_class
     from lidargrit.generation.presets import load_preset

@@ -12,13 +12,11 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
     parser.add_argument("--to", default="", help="sensor of the dense scans (default: that of the run)")
     add_completion(parser, "run that adds the rows, or nearest, linear or triangulation", points_only=True)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Add the rows, and say where the scans are."""
     from lidargrit.inference.complete.tasks import AddRows
     from lidargrit.scans.sensors import load_sensor
 

@@ -15,26 +15,22 @@ EXAMPLES = """\
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Name the options."""
-    parser.add_argument(
-        "scans", nargs="+", metavar="SCANS", help="source of scans: a file, a folder, samples, or a run"
-    )
-    parser.add_argument(
-        "-o", "--out", type=Path, default=Path("view.png"), help="picture (.png) or interactive page (.html) to write"
-    )
+    add = parser.add_argument
+    add("scans", nargs="+", metavar="SCANS", help="source of scans: a file, a folder, samples, or a run")
+    out = "picture (.png) or interactive page (.html) to write"
+    add("-o", "--out", type=Path, default=Path("view.png"), help=out)
     add_count(parser, 3, help="number of scans of each")
-    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first generated scan")
+    add("--seed", type=seed_number, default=0, help="seed of the first generated scan")
     colour = "colour of pixels: range, or surprise for the bits beyond those expected"
-    parser.add_argument("--color", choices=["range", "surprise"], default="range", help=colour)
+    add("--color", choices=["range", "surprise"], default="range", help=colour)
     model = "run whose likelihood gives the surprise; needs a pixel decoder (default: pretrained)"
-    parser.add_argument("--model", default="", help=model)
+    add("--model", default="", help=model)
     add_scans(parser)
     add_device(parser)
-    parser.add_argument("--overwrite", action="store_true", help="replace the file if it exists")
+    add("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
-    """Render the picture, or write the page."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.viewer import view

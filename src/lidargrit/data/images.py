@@ -3,9 +3,9 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
-from itertools import accumulate
+from itertools import accumulate, chain
 from types import MappingProxyType
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -45,6 +45,11 @@ class Provenance:
     recordings: tuple[str, ...] = ()
     fingerprints: tuple[str, ...] = ()
     range_fingerprints: tuple[str, ...] = ()
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Provenance]") -> "Provenance":
+        """Join the provenances of several sets, in their order."""
+        return cls(*(tuple(chain.from_iterable(getattr(part, of.name) for part in parts)) for of in fields(cls)))
 
     def overlap(self, other: "Provenance") -> str:
         """Return in a few words what two sets share; "" if they share nothing that is known.
@@ -102,13 +107,7 @@ class RangeImages:
     @property
     def provenance(self) -> Provenance:
         """Provenance of all images, in their order."""
-        parts = [store.provenance for store in self._stores]
-        return Provenance(
-            tuple(name for part in parts for name in part.names),
-            tuple(recording for part in parts for recording in part.recordings),
-            tuple(fingerprint for part in parts for fingerprint in part.fingerprints),
-            tuple(fingerprint for part in parts for fingerprint in part.range_fingerprints),
-        )
+        return Provenance.joined([store.provenance for store in self._stores])
 
     @cached_property
     def _planes(self) -> frozenset[str]:

@@ -19,17 +19,18 @@ from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, LidarGritError
 from lidargrit.core.files import claim_folder, read_json, write_json
 from lidargrit.core.processes import check_processes, process_pool
+from lidargrit.core.table import Format, render
 from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
 from lidargrit.data.sources import SampleSource, Source, TensorSource, data_set_of, open_source
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
-from lidargrit.evaluation.costs import COSTS, Costs, costs_block, read_costs
+from lidargrit.evaluation.costs import COSTS, Costs, costs_table, read_costs
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, require_same_rays
 from lidargrit.evaluation.protocols import MetricChoice, load_protocol, public_name
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
-from lidargrit.evaluation.tables import Format, render, share_pixel_statistics, side_by_side
+from lidargrit.evaluation.tables import share_pixel_statistics, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.generation.presets import is_preset, load_preset
@@ -50,8 +51,6 @@ class Benchmark:
 
     Args:
         reference: source of real scans on which none of the systems was trained.
-        num_samples: number of samples of each system.
-        settings: settings of the evaluation, above all its protocol.
         preset_settings: settings that are given to every preset, as by ``train --set``, so that all systems get the
             same data.
         flops: operations of the training of each system; 0 keeps every preset's own budget.
@@ -87,12 +86,7 @@ class Benchmark:
         return with_budget(preset, self.flops) if self.flops else preset
 
 
-def run(
-    systems: Sequence[str],
-    folder: Path,
-    benchmark: Benchmark,
-    processes: int = 1,
-) -> list[Path]:
+def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: int = 1) -> list[Path]:
     """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:
@@ -284,8 +278,8 @@ class _Remaining:
 
 def as_table(scores: Sequence[Path], form: Format = "text", remarks: Sequence[str] = ()) -> str:
     """Return the scores side by side, below them what each system costs, and remarks."""
-    costs = costs_block([(path.stem, path.parent / COSTS) for path in scores], remarks)
-    return f"{side_by_side(scores, form)}\n\n{render([costs], form)}"
+    costs = costs_table([(path.stem, path.parent / COSTS) for path in scores], remarks)
+    return render([*side_by_side(scores), costs], form)
 
 
 def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
@@ -300,10 +294,8 @@ class _Plan:
     """How one system is made: from a finished run, or by training a preset; or its samples, which are there.
 
     Args:
-        system: name of the system, as the user typed it.
         run: folder of a finished run, or of the one that the preset gets, or of samples.
         preset: preset that is trained; None for a finished run.
-        samples: the samples, if they are there; None otherwise.
     """
 
     system: str

@@ -7,18 +7,19 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from lidargrit.core import reporting
+from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, LidarGritError, nearest_names, one_of
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
 from lidargrit.core.version import __version__
-from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import Source, open_source
+from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.sources import RunSource, SampleSource, Source, TensorSource, open_source
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
 from lidargrit.evaluation.scoring import MetricFactory, score_metrics
+from lidargrit.nn.devices import usable_device
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import load_sensor
 
@@ -90,13 +91,12 @@ class EvalConfig:
                 every = [MetricChoice(name, variant) for variant in cls.variants]
                 wanted += every if public_name(self.protocol) == DEFAULT or not its_own else its_own
         if self.variant:
-            _require_known(self.variant, wanted)
+            known = {name for choice in wanted for name in load_metric(choice.metric).variants}
+            if self.variant not in known:  # where some have it, the others are left out and say so
+                such = f"one such as {nearest_names(self.variant, known)}"
+                raise ConfigError(f"variant {self.variant!r}", such, "choose one of these")
             wanted = [replace(choice, variant=self.variant) for choice in wanted]
-        kept: list[MetricChoice] = []
-        for choice in wanted:
-            if choice not in kept:
-                kept.append(choice)
-        return kept
+        return list(dict.fromkeys(wanted))
 
     def data_config(self) -> DataConfig:
         """Return the settings by which scans of either set are read and projected, as the protocol or the user says."""
@@ -123,6 +123,48 @@ class EvalConfig:
         }
 
 
+def read_config(
+    scans: ScanSettings | None = None,
+    *,
+    metrics: Sequence[str] = (),
+    weights: Sequence[str] = (),
+    groups: int = 16,
+    intervals: int = 20,
+    **settings: Any,
+) -> EvalConfig:
+    """Turn words and numbers, as a user types them, into a configuration.
+
+    Args:
+        weights: words such as ``pointnet=FILE``.
+    """
+    scans = scans or ScanSettings()
+    settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans
+    return EvalConfig(
+        metrics=tuple(metrics),
+        resampling=Resampling(groups, intervals, max(settings.get("seed", 0), 0)),
+        weights=_weights(weights),
+        sensor=scans.sensor,
+        projection_variant=scans.projection_variant,
+        data=scans.data,
+        **settings,
+    )
+
+
+def _weights(words: Sequence[str]) -> dict[str, Path]:
+    """Turn words such as ``pointnet=FILE`` into files by the name of their network."""
+    if not words:
+        return {}
+    known = {load_metric(name).needs_weights for name in discovery.names("metrics")} - {""}
+    files = {}
+    for word in words:
+        name, equals, path = word.partition("=")
+        if not (equals and path) or name not in known:
+            wanted = f"NAME=FILE with {nearest_names(name, known)} for NAME"
+            raise ConfigError(f"--weights {word}", wanted, "name a network and the file with its weights")
+        files[name] = Path(path)
+    return files
+
+
 def compare_sources(samples: str, reference: str, settings: EvalConfig | None = None) -> tuple[Scorecard, EvalPair]:
     """Score a folder of samples, or any source of scans, against another.
 
@@ -137,9 +179,24 @@ def compare_sources(samples: str, reference: str, settings: EvalConfig | None = 
         LidarGritError: not one metric could be computed; what the first said.
     """
     settings = settings or EvalConfig()
+    if not (samples and reference):
+        got = f"{samples!r} alone" if samples else "nothing to score"
+        raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
+    usable_device(settings.device)
     first = open_source(samples, settings.data.bad_points, settings.samples_format)
-    pair = open_pair(first, open_source(reference, settings.data.bad_points), settings)
-    return compare_pair(pair, settings), pair
+    second = open_source(reference, settings.data.bad_points)
+    if isinstance(first, RunSource):
+        raise ConfigError(
+            f"the run {samples}, which holds no scans",
+            "its samples, or scans to measure under it",
+            f"lidargrit sample {samples} FOLDER, or lidargrit likelihood {reference} --model {samples}",
+        )
+    _refuse_unused(first, settings)
+    pair = open_pair(first, second, settings)
+    card = compare_pair(pair, settings)
+    for warning in card.warnings[len(pair.warnings) :]:
+        reporting.message(f"WARNING: {warning}")
+    return card, pair
 
 
 def open_pair(samples: Source, reference: Source, settings: EvalConfig) -> EvalPair:
@@ -156,15 +213,8 @@ def open_pair(samples: Source, reference: Source, settings: EvalConfig) -> EvalP
     return pair
 
 
-def compare_pair(
-    pair: EvalPair,
-    settings: EvalConfig,
-) -> Scorecard:
+def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
     """Score two opened sets.
-
-    Args:
-        pair: the two sets.
-        settings: protocol and its changes.
 
     Raises:
         LidarGritError: not one metric could be computed; the reason of the first.
@@ -241,13 +291,6 @@ def _other_definitions(scores: Sequence[Score], protocol: Protocol) -> list[str]
     ]
 
 
-def _require_known(variant: str, wanted: Sequence[MetricChoice]) -> None:
-    """Refuse a variant that no wanted metric has; where some have it, the others are left out and say so."""
-    known = {name for choice in wanted for name in load_metric(choice.metric).variants}
-    if variant not in known:
-        raise ConfigError(f"variant {variant!r}", f"one such as {nearest_names(variant, known)}", "choose one of these")
-
-
 def metric_factory(choice: MetricChoice, settings: EvalConfig) -> MetricFactory:
     """Return what makes empty metrics of one definition, by the settings of an evaluation."""
     weights = settings.weights.get(load_metric(choice.metric).needs_weights)
@@ -267,3 +310,29 @@ def _doubts(scores: Sequence[Score], settings: EvalConfig) -> list[str]:
         name = f"{score.result.metric} ({score.result.variant})"
         found += [f"{name}: {text}" for text in score.result.details.get("warnings", [])]
     return found
+
+
+def _refuse_unused(samples: Source, config: EvalConfig) -> None:
+    """Refuse a sensor or columns for generated images, which keep their own, and weights that no metric needs."""
+    if isinstance(samples, (SampleSource, TensorSource)):
+        columns, stride, default = config.data.columns, config.data.column_stride, DataConfig()
+        held = f"for {samples.text}, which holds {samples.kind}"
+        if config.sensor:
+            raise ConfigError(
+                f"--sensor {config.sensor} {held}",
+                "a sensor for scans, or for range images in .npy files",
+                "leave --sensor out: the reference is projected with the sensor of the samples",
+            )
+        if (columns, stride) != (default.columns, default.column_stride):
+            raise ConfigError(
+                f"--set data.columns={columns} data.column_stride={stride} {held}",
+                "columns for scans, or for range images in .npy files",
+                "leave them out: the reference is projected to the columns of the samples",
+            )
+    needed = {load_metric(choice.metric).needs_weights for choice in config.chosen_metrics()}
+    if unused := sorted(config.weights.keys() - needed):
+        raise ConfigError(
+            f"--weights {unused[0]}={config.weights[unused[0]]}, which none of the chosen metrics needs",
+            f"weights of {one_of(sorted(needed - {''}))}" if needed - {""} else "no weights",
+            "leave it out, or choose a metric or protocol that needs it",
+        )

@@ -2,10 +2,9 @@
 
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,8 +13,9 @@ from torch import Tensor
 from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, DataError, UsageError, counted_scans
+from lidargrit.core.table import Table
 from lidargrit.data.images import RangeImages
-from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices
 from lidargrit.inference.complete import Model
@@ -28,7 +28,9 @@ PATTERNS = ("rows:4", "sector:45,315", "pixels:0.1")
 """Patterns that are compared unless others are named: every fourth row, all but 90 degrees ahead, a tenth."""
 BASELINE = "triangulation"
 VOXEL_M = 0.1
-_REFLECTANCE_WIDTH = 25  # of the column, in letters
+Measure = Callable[[RangeImage, RangeImage, Bool[Tensor, "H W"]], float]  # of two images, over hidden pixels
+_HEAD = ("model", "MAE [m]", "MAE - triangulation [m]", "found", "IoU", "drop runs", "diversity [m]", "s/scan")
+_WHERE_KNOWN = ("reflectance MAE", "class accuracy", "mIoU")
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,6 @@ class CompletionScore:
     Args:
         model: name of the model or method, as the user typed it.
         observed: pattern of the observed pixels.
-        num_scans: number of scans.
         mae_m: mean absolute error of the range, over pixels that return in both scans; lower is better.
         found: share of the true hidden returns where the completed scan has a return, too; ``mae_m`` covers only these.
         iou: intersection over union of the 0.1 m voxels that hold a point; higher is better.
@@ -75,11 +76,7 @@ class CompletionScore:
 
 
 def compare_completion(
-    images: RangeImages,
-    models: Sequence[Model],
-    patterns: Sequence[Pattern],
-    completions: int = 2,
-    seed: int = 0,
+    images: RangeImages, models: Sequence[Model], patterns: Sequence[Pattern], completions: int = 2, seed: int = 0
 ) -> list[CompletionScore]:
     """Hide parts of scans, have every model fill them in, and compare.
 
@@ -115,40 +112,31 @@ def compare_completion(
     return scores
 
 
-def as_table(scores: Sequence[CompletionScore]) -> str:
-    """Return scores as lines for a terminal."""
-    lines = []
-    width = max(len(score.model) for score in scores) + 2
+def tables(scores: Sequence[CompletionScore]) -> list[Table]:
+    """Return a table for each pattern."""
+    found = []
     for pattern in dict.fromkeys(score.observed for score in scores):
-        lines.append(f"observed: {pattern}")
-        head = f"{'MAE [m]':>24}{'MAE - triangulation [m]':>25}{'found':>8}{'IoU':>8}{'drop runs':>11}"
-        labelled = any(score.class_accuracy is not None for score in scores)
-        of_classes = f"{'class accuracy':>16}{'mIoU':>7}" if labelled else ""
-        bright = any(score.reflectance_error is not None for score in scores)
-        of_reflectance = f"{'reflectance MAE':>{_REFLECTANCE_WIDTH}}" if bright else ""
-        lines.append(" " * width + head + f"{'diversity [m]':>15}{'s/scan':>10}{of_reflectance}{of_classes}")
-        for score in scores:
-            if score.observed != pattern:
-                continue
-            beside = "" if score.beside_triangulation_m is None else score.beside_triangulation_m.as_text("+.3f")
-            diversity = "" if score.diversity_m is None else f"{score.diversity_m.value:.3f}"
-            error = "" if score.reflectance_error is None else score.reflectance_error.as_text(".4f")
-            of_reflectance = f"{error:>{_REFLECTANCE_WIDTH}}" if bright else ""
-            of_classes = ""
-            if score.class_accuracy is not None and score.class_iou is not None:
-                of_classes = f"{score.class_accuracy.value:>16.3f}{score.class_iou:>7.3f}"
-            lines.append(
-                f"{score.model:<{width}}{score.mae_m.as_text('.3f'):>24}{beside:>25}{score.found.value:>8.3f}"
-                f"{score.iou.value:>8.3f}{score.drop_run_lengths:>11.4f}{diversity:>15}{score.seconds_per_scan:>10.3f}"
-                + of_reflectance
-                + of_classes
-            )
-    return "\n".join(lines)
+        rows = tuple(_row(score) for score in scores if score.observed == pattern)
+        table = Table((*_HEAD, *_WHERE_KNOWN), rows, f"observed: {pattern}")
+        found.append(table.without_empty(*_WHERE_KNOWN))
+    return found
 
 
-def as_json(scores: Sequence[CompletionScore]) -> list[dict[str, Any]]:
-    """Return scores for a file."""
-    return [asdict(score) for score in scores]
+def _row(score: CompletionScore) -> tuple[str, ...]:
+    beside, diversity, error = score.beside_triangulation_m, score.diversity_m, score.reflectance_error
+    return (
+        score.model,
+        score.mae_m.as_text(".3f"),
+        "" if beside is None else beside.as_text("+.3f"),
+        f"{score.found.value:.3f}",
+        f"{score.iou.value:.3f}",
+        f"{score.drop_run_lengths:.4f}",
+        "" if diversity is None else f"{diversity.value:.3f}",
+        f"{score.seconds_per_scan:.3f}",
+        "" if error is None else error.as_text(".4f"),
+        "" if score.class_accuracy is None else f"{score.class_accuracy.value:.3f}",
+        "" if score.class_iou is None else f"{score.class_iou:.3f}",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,19 +164,17 @@ def _score(
     filled = [_complete(model, condition, turn, seed) for turn in range(turns)]
     seconds = (time.perf_counter() - begin) / (len(whole) * turns)
     hidden = ~condition.return_observed
-    errors = [_mean([_error_m(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
-    found = [_mean([_found(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
-    ious = [_mean([_iou(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))]
-    apart = [
-        _mean([_error_m(one[i], other[i], hidden[i]) for one, other in combinations(filled, 2)])
-        for i in range(len(whole))
-    ]
+
+    def each(measure: Measure, pairs: Sequence[tuple[RangeImage, RangeImage]]) -> list[float]:
+        """Return the mean over pairs of batches of what is measured of each scan."""
+        return [_mean([measure(one[i], other[i], hidden[i]) for one, other in pairs]) for i in range(len(whole))]
+
+    with_truth = [(images, whole) for images in filled]
+    errors, of_reflectance = each(_error_m, with_truth), each(_reflectance_error, with_truth)
+    apart = each(_error_m, [*combinations(filled, 2)])
     classes = [_confusion(filled[0][i], whole[i], hidden[i]) for i in range(len(whole))]
     confusions = [one for one in classes if one is not None]
     bright = whole.reflectance is not None and filled[0].reflectance is not None
-    of_reflectance = [
-        _mean([_reflectance_error(images[i], whole[i], hidden[i]) for images in filled]) for i in range(len(whole))
-    ]
     runs = load_metric("drop_run_lengths")()
     runs.update(filled[0], real=False)
     runs.update(whole, real=True)
@@ -197,8 +183,8 @@ def _score(
         pattern.text,
         len(whole),
         Estimate.of(errors),
-        Estimate.of(found),
-        Estimate.of(ious),
+        Estimate.of(each(_found, with_truth)),
+        Estimate.of(each(_iou, with_truth)),
         runs.compute().value,
         Estimate.of(apart) if turns > 1 else None,
         seconds,
@@ -227,20 +213,22 @@ def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
             found.append(each.score)
             continue
         difference = Estimate.of([own - its for own, its in zip(each.errors_m, base, strict=True)])
-        found.append(CompletionScore(**{**vars(each.score), "beside_triangulation_m": difference}))
+        found.append(replace(each.score, beside_triangulation_m=difference))
     return found
 
 
 def _error_m(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
-    both = hidden & one.return_mask & other.return_mask
-    return float((one.range_m - other.range_m)[both].double().abs().mean()) if bool(both.any()) else math.nan
+    return _mean_error(one.range_m, other.range_m, hidden & one.return_mask & other.return_mask)
 
 
-def _reflectance_error(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
-    both = hidden & filled.return_mask & true.return_mask
-    if filled.reflectance is None or true.reflectance is None or not bool(both.any()):
+def _reflectance_error(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:
+    if one.reflectance is None or other.reflectance is None:
         return math.nan
-    return float((filled.reflectance - true.reflectance)[both].double().abs().mean())
+    return _mean_error(one.reflectance, other.reflectance, hidden & one.return_mask & other.return_mask)
+
+
+def _mean_error(one: Float[Tensor, "H W"], other: Float[Tensor, "H W"], both: Bool[Tensor, "H W"]) -> float:
+    return float((one - other)[both].double().abs().mean()) if bool(both.any()) else math.nan
 
 
 def _found(filled: RangeImage, true: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:

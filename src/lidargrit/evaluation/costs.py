@@ -1,4 +1,4 @@
-"""What a system of a benchmark costs: parameters, operations, time and bits → costs.json → a block of the table."""
+"""What a system of a benchmark costs: parameters, operations, time and bits → costs.json → a table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,21 +8,21 @@ from typing import Any
 from lidargrit.core import reporting
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.files import read_json, write_json
+from lidargrit.core.table import Table
 from lidargrit.evaluation.likelihood import bits_per_return
 from lidargrit.evaluation.pairs import EvalSet
-from lidargrit.evaluation.tables import TableBlock
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.settings import Preset
 from lidargrit.training import training_flops
 
 COSTS = "costs.json"
 _ENTRIES = {  # entry of the file → name and unit in the table; None where it is not known
-    "parameters": ("parameters", "all networks"),
-    "training_flops": ("training", "FLOPs"),
-    "flops_per_scan": ("sampling", "FLOPs/scan"),
-    "network_evaluations": ("network evaluations", "per scan"),
-    "seconds_per_scan": ("time", "s/scan"),
-    "bits_per_return": ("likelihood", "bits/return"),
+    "parameters": "parameters (all networks)",
+    "training_flops": "training (FLOPs)",
+    "flops_per_scan": "sampling (FLOPs/scan)",
+    "network_evaluations": "network evaluations (per scan)",
+    "seconds_per_scan": "time (s/scan)",
+    "bits_per_return": "likelihood (bits/return)",
 }
 _NOTES = (
     "time: on this machine, in batches; likelihood: of at most 64 scans of the reference, ranges in steps of 10 mm, "
@@ -32,12 +32,7 @@ _NOTES = (
 
 @dataclass(frozen=True)
 class Costs:
-    """The file with what one system costs.
-
-    Args:
-        path: the file, ``costs.json``.
-        weights_sha256: hash of the weights of the system's run.
-    """
+    """The file with what one system costs."""
 
     path: Path
     weights_sha256: str
@@ -99,19 +94,14 @@ def read_costs(path: Path) -> dict[str, Any]:
     return of
 
 
-def costs_block(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) -> TableBlock:
-    """Return the costs of several systems as a block of a table.
-
-    Args:
-        files: name of each system, and its ``costs.json``.
-        remarks: lines to print below the costs.
-    """
+def costs_table(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) -> Table:
+    """Return the costs of several systems."""
     rows = []
     for name, path in files:
         of = read_costs(path)
         numbers = [of[entry] for entry in _ENTRIES]
-        rows.append((name, tuple("" if number is None else _as_text(number) for number in numbers)))
-    return TableBlock("Costs", tuple(_ENTRIES.values()), tuple(rows), (*_NOTES, *remarks))
+        rows.append((name, *("" if number is None else _as_text(number) for number in numbers)))
+    return Table(("system", *_ENTRIES.values()), tuple(rows), "Costs", notes=(*_NOTES, *remarks))
 
 
 def _as_text(number: int | float) -> str:

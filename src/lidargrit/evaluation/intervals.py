@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Float64
 from scipy.special import stdtrit
 
 from lidargrit.core.errors import ConfigError, DataError
@@ -29,6 +30,7 @@ from lidargrit.scans.types import MetricResult
 _HALVINGS = 5  # of the reference against itself: their mean is reported, not their spread
 _AT_LEAST = 4  # groups: fewer have too few halves
 _LARGE_BYTES = 8 << 20
+_GROUPS = 16
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,6 @@ class Interval:
             Student's 97.5 % quantile: 2.13 for 16 groups and 20 halves (1.96 for many), since few halves give only a
             rough standard error.
         high: value plus t standard errors, clipped to the metric's bounds.
-        standard_error: standard deviation of the scores of half-samples.
-        halves: number of half-samples.
         mean_of_halves: mean score of half-samples, which have as many scans as the halves of real against real; None in
             files of earlier versions.
         values: scores of the half-samples; none in files of earlier versions. Systems that were scored alike, against
@@ -88,7 +88,6 @@ class RealAgainstReal:
         value: mean over halvings of the reference, one half against the other.
         num_scans: number of scans in each half, on average. Most metrics fall as sets grow, some by a third where they
             double: so compare it with ``Interval.mean_of_halves``.
-        halvings: number of halvings.
         spread: standard deviation of the scores of single halvings; None in files of earlier versions.
     """
 
@@ -103,7 +102,6 @@ class Score:
     """One score with its interval and its reference rows.
 
     Args:
-        result: value of the metric.
         interval: 95 % interval; None if it was not wanted or cannot be computed.
         real_against_real: score of real scans in place of the samples; None if it was not computed.
         seconds: time that the metric, its interval and real against real took.
@@ -168,20 +166,9 @@ def merged(generated: Sequence[Part], real: Sequence[Part], whole: Metric | None
 
 
 def interval_of(
-    value: float,
-    whole: Metric,
-    generated: Sequence[Part],
-    real: Sequence[Part],
-    resampling: Resampling,
+    value: float, whole: Metric, generated: Sequence[Part], real: Sequence[Part], resampling: Resampling
 ) -> Interval | None:
-    """Return the confidence interval of the score of the whole sets; None if there are too few scans.
-
-    Args:
-        whole: metric that was fed the whole sets.
-        generated: metrics that were fed one group of generated scans each.
-        real: metrics that were fed one group of real scans each.
-        resampling: number of halves and seed.
-    """
+    """Return the confidence interval of the score of the whole sets; None if there are too few scans."""
     if min(len(generated), len(real)) < _AT_LEAST:
         return None
     rng = np.random.default_rng((resampling.seed, 1))
@@ -203,12 +190,6 @@ def around(value: float, half_values: Sequence[float], groups: int, bounds: tupl
 
     The spread of the half-samples is taken about their own mean: a score of half as many scans is biased against that
     of all.
-
-    Args:
-        value: score of the whole sets.
-        half_values: scores of half-samples.
-        groups: number of groups from which the half-samples were taken.
-        bounds: least and greatest value that the metric can have.
     """
     error, reach = spread_of(half_values, groups)
     least = max(bounds[0], 0.0) if min(value, *half_values) >= 0 else bounds[0]
@@ -220,8 +201,6 @@ def spread_of(half_values: Sequence[float], groups: int, together: int = 1) -> t
     """Return the standard error of a score, and half the width of its 95 % interval.
 
     Args:
-        half_values: scores of half-samples.
-        groups: number of groups from which the half-samples were taken.
         together: number of scores that the 95 % hold for at once (Bonferroni).
     """
     error = float(np.std(half_values, ddof=1))
@@ -229,21 +208,9 @@ def spread_of(half_values: Sequence[float], groups: int, together: int = 1) -> t
 
 
 def real_against_real(
-    whole: Metric,
-    real: Sequence[Part],
-    real_as_generated: Sequence[Part],
-    sizes: Sequence[int],
-    resampling: Resampling,
+    whole: Metric, real: Sequence[Part], real_as_generated: Sequence[Part], sizes: Sequence[int], resampling: Resampling
 ) -> RealAgainstReal | None:
-    """Return the mean score of one half of the reference against the other; None if there are too few scans.
-
-    Args:
-        whole: metric that was fed the whole sets, generated and real.
-        real: metrics that were fed one group of real scans each.
-        real_as_generated: metrics that were fed the same scans as generated ones.
-        sizes: number of scans in each group.
-        resampling: settings of the resampling, of which only the seed is used.
-    """
+    """Return the mean score of one half of the reference against the other; None if there are too few scans."""
     if len(real) < _AT_LEAST:
         return None
     rng = np.random.default_rng((resampling.seed, 2))
@@ -264,3 +231,53 @@ def format_value(value: float) -> str:
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     return f"{value:.4f}" if 1e-2 <= abs(value) < 1e3 else f"{value:.4g}"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over scans, or a ratio of two.
+
+    Args:
+        value: mean or ratio; NaN where no scan has a value.
+        low: lower end of its 95 % interval, from groups of neighbouring scans; NaN with fewer than two groups.
+        high: upper end of the interval.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Estimate":
+        """Return the mean of one value a scan, without those that are NaN, with Student's interval over groups."""
+        every = np.asarray(values, dtype=float)
+        present = every[~np.isnan(every)]
+        mean = float(present.mean()) if len(present) else math.nan
+        return cls._around(mean, every)
+
+    @classmethod
+    def of_ratio(cls, values: Sequence[float], counts: Sequence[float]) -> "Estimate":
+        """Return the sum of the values by the sum of the counts, such as bits by returns, with the same interval.
+
+        Source:
+            Cochran, Sampling Techniques, 1977, section 6.3: the variance of a ratio from residuals.
+        """
+        value, count = np.asarray(values, dtype=float), np.asarray(counts, dtype=float)
+        if not count.sum() > 0:
+            return cls(math.nan, math.nan, math.nan)
+        ratio = float(value.sum() / count.sum())
+        return cls._around(ratio, ratio + (value - ratio * count) / count.mean())
+
+    def as_text(self, form: str) -> str:
+        """Return the value and its interval, if there is one, in a format such as ``.3f``."""
+        interval = "" if math.isnan(self.low) else f" [{self.low:{form}}, {self.high:{form}}]"
+        return f"{self.value:{form}}{interval}"
+
+    @classmethod
+    def _around(cls, estimate: float, values: Float64[np.ndarray, " n"]) -> "Estimate":
+        groups = [values[group.start : group.stop] for group in blocks(len(values), _GROUPS)]
+        means = np.asarray([group[~np.isnan(group)].mean() for group in groups if not np.isnan(group).all()])
+        if len(means) < 2:
+            return cls(estimate, math.nan, math.nan)
+        reach = float(stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / math.sqrt(len(means)))
+        return cls(estimate, estimate - reach, estimate + reach)

@@ -12,11 +12,12 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
+from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import DatasetSource, RunSource, open_source, overlap
-from lidargrit.evaluation.estimates import Estimate
+from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.generator import Generator, load
@@ -37,9 +38,7 @@ class Likelihood:
 
     Args:
         is_whole: whether the bits name the whole scan, or only its tokens.
-        names: name of each scan.
         parts: bits of each scan, by the name of the part: ``tokens``, ``mask``, ``range``.
-        returns: number of returns of each scan.
         pixels: number of pixels of a scan, which is the same for all.
     """
 
@@ -72,17 +71,15 @@ class Likelihood:
         facts = {"step_mm": self.step_mm, "whole_scan": self.is_whole, "num_scans": len(self.names)}
         return {**facts, "pixels": self.pixels, "bits": bits, "scans": scans}
 
-    def as_table(self) -> str:
-        """Return a table for people."""
-        lines = [f"{'bits':8}" + "".join(f"{unit:>26}" for unit in _UNITS.values())]
-        for part, estimates in self.estimates().items():
-            lines.append(f"{part:8}" + "".join(f"{_as_text(estimates[unit]):>26}" for unit in _UNITS))
+    def table(self) -> Table:
+        """Return the bits by part and by unit."""
+        rows = [(part, *(_as_text(units[unit]) for unit in _UNITS)) for part, units in self.estimates().items()]
         returns = f"{sum(self.returns) / len(self.returns):,.0f} returns a scan"
         steps = f"ranges in steps of {self.step_mm} mm"
-        lines.append(f"{len(self.names)} scans, {returns}, {steps}; 95 % intervals over scans")
+        notes = [f"{len(self.names)} scans, {returns}, {steps}; 95 % intervals over scans"]
         if not self.is_whole:
-            lines.append("tokens alone: this model has no probabilities of returns and ranges (no pixel decoder)")
-        return "\n".join(lines)
+            notes.append("tokens alone: this model has no probabilities of returns and ranges (no pixel decoder)")
+        return Table(("bits", *_UNITS.values()), tuple(rows), notes=tuple(notes))
 
 
 def _as_text(estimate: Estimate) -> str:
@@ -90,15 +87,11 @@ def _as_text(estimate: Estimate) -> str:
 
 
 def score_likelihood(
-    generator: Generator,
-    images: RangeImages,
-    step_mm: int = 10,
-    maps: Path | None = None,
+    generator: Generator, images: RangeImages, step_mm: int = 10, maps: Path | None = None
 ) -> Likelihood:
     """Return the bits of all images of a set; every scan is coded by itself.
 
     Args:
-        generator: model with the capability ``likelihood``.
         maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
     """
     parts: dict[str, list[float]] = {}
@@ -156,12 +149,7 @@ def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[BinaryIO | 
 
 
 def measure_source(
-    text: str,
-    model: str,
-    step_mm: int,
-    config: DataConfig,
-    maps: Path | None = None,
-    device: str = "",
+    text: str, model: str, step_mm: int, config: DataConfig, maps: Path | None = None, device: str = ""
 ) -> tuple[str, dict[str, Any]]:
     """Measure the scans of a source by a finished run: their bits, and the errors of their reconstructions.
 
@@ -187,12 +175,12 @@ def measure_source(
         reporting.message(
             f"WARNING: {run.text} has learned from some of these scans ({shared}): the figures flatter it"
         )
-    tables: list[str] = []
+    tables: list[Table] = []
     values: dict[str, Any] = {"model": model, "source": text, "projection_variant": variant}
     if "likelihood" in generator.capabilities or maps is not None or not has_tokens:  # else refused, with what it lacks
         found = score_likelihood(generator, images, step_mm, maps)
-        tables, values = [found.as_table()], {**values, **found.as_json()}
+        tables, values = [found.table()], {**values, **found.as_json()}
     if has_tokens:
         errors = score_reconstruction(generator.get_tokenizer(), images)
-        tables, values = [*tables, errors.as_table()], {**values, "reconstruction": asdict(errors)}
-    return "\n\n".join(tables), values
+        tables, values = [*tables, errors.table()], {**values, "reconstruction": asdict(errors)}
+    return render(tables), values

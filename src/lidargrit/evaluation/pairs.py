@@ -118,16 +118,11 @@ class EvalPair:
 
 
 def pair_for_protocol(
-    samples: Source,
-    reference: Source,
-    protocol: Protocol,
-    config: DataConfig,
-    sensor: SensorModel | None = None,
+    samples: Source, reference: Source, protocol: Protocol, config: DataConfig, sensor: SensorModel | None = None
 ) -> EvalPair:
     """Read two sets as a protocol wants them.
 
     Args:
-        samples: source of the first set.
         reference: source of the second set; scans are projected with the sensor of the first.
         protocol: definition of the sensor, range window, data set and number of scans that are wanted.
         config: settings of reading and projecting scans; ``max_scans`` further limits their number.

@@ -1,20 +1,23 @@
-"""Drops of a model on clean scans, and independent drops → distances of their curves from those of true drops."""
+"""Simulated streets, or a model that drops returns of clean scans → distances of their curves from real ones."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.table import render
+from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
-from lidargrit.evaluation.realism import SimulatedScans, distance, drop_independently
+from lidargrit.data.sources import DatasetSource, open_source
+from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.protocols import public_name
+from lidargrit.evaluation.realism import CurveScore, SimulatedScans, compare, scans_of_both, score_curves, tables
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import ranges_from_others
-from lidargrit.scans.types import MetricResult, RangeImage
+from lidargrit.scans.types import RangeImage
 
 RAYDROP_CURVES = (
     "return_rate_per_ring",
@@ -25,35 +28,43 @@ RAYDROP_CURVES = (
 )
 """Curves that depend on which rays return, each a Jensen-Shannon distance."""
 
-_TITLES = {
-    "simulated": "raydrop of simulated scans",
-    "real": "... real scans, decoded",
-    "real_triangulated": "... real, triangulated",
-}
+
+def streets_of(samples: str, config: EvalConfig) -> Streets | None:
+    """Return the simulated streets that the protocol ``streets`` scores; None for other samples and protocols."""
+    if public_name(config.protocol) != "streets" or not samples.startswith("simulated"):
+        return None
+    source = open_source(samples, config.data.bad_points)
+    streets = source.scans() if isinstance(source, DatasetSource) else None
+    return streets if isinstance(streets, Streets) else None
 
 
-@dataclass(frozen=True)
-class RaydropScore:
-    """Jensen-Shannon distances, from 0 (alike) to 1, of one curve between true scans and scans with sampled drops.
+def evaluate_streets(
+    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str
+) -> tuple[str, dict[str, Any], list[CurveScore]]:
+    """Compare simulated streets, and independent drops of their clean scans, with real scans.
 
     Args:
-        scans: kind of the scans to which drops are added: ``simulated``; ``real``, with ranges that a tokenizer
-            decodes; or ``real_triangulated``, with ranges that are interpolated from other rays' returns.
-        bernoulli: distance between the true drops and independent drops of one probability, on the same clean ranges.
-        real_against_real: distance between the two halves of the true scans.
+        model: run that drops returns of clean scans, which is compared too; none if empty.
+
+    Returns:
+        tables, their plain values, and the curves, which can be plotted.
     """
+    drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
+    simulated, real = scans_of_both(
+        streets, open_source(reference, config.data.bad_points), config.sensor, config.data_config()
+    )
+    of_model = scores_of_model(drops, simulated, real) if drops else []
+    scores = compare(simulated, real)
+    about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
+    found = {"curves": [each.to_json() for each in scores], "raydrop": [each.to_json() for each in of_model]}
+    return render(tables([*scores, *of_model])), {**about, **found}, scores
 
-    scans: str
-    model: MetricResult
-    bernoulli: MetricResult
-    real_against_real: MetricResult
 
-
-def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: RangeImage) -> list[RaydropScore]:
+def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: RangeImage) -> list[CurveScore]:
     """Drop returns of clean scans by a model, and independently of one another, and compare both with the true scans.
 
     Args:
-        scans: kind of the scans; see :class:`RaydropScore`.
+        scans: kind of the scans; see :class:`.CurveScore`.
         clean: batch of range images in which every surface returns.
         true: measured range images of the same scans, with true drops.
     """
@@ -63,18 +74,7 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
         some = clean[first : first + generator.compute_batch]
         seeds = range(first, first + len(some))
         dropped.append(generator.complete(Observed.of_surfaces(some), seeds).to("cpu"))
-    by_model = RangeImage.cat(dropped)
-    independent = drop_independently(clean, float(true.return_mask.float().mean()))
-    half = len(true) // 2
-    return [
-        RaydropScore(
-            scans,
-            distance(name, [by_model], _only(true)),
-            distance(name, [independent], _only(true)),
-            distance(name, [true[:half]], _only(true[half:])),
-        )
-        for name in RAYDROP_CURVES
-    ]
+    return score_curves(RangeImage.cat(dropped), clean, true, RAYDROP_CURVES, scans)
 
 
 def raydrop_model(word: str, device: str = "") -> Generator:
@@ -89,14 +89,8 @@ def raydrop_model(word: str, device: str = "") -> Generator:
     return generator
 
 
-def scores_of_model(generator: Generator, simulated: SimulatedScans, real: RangeImages) -> list[RaydropScore]:
-    """Score a model's drops: on simulated scans, whose clean ranges are known, and on real ones, estimated twice.
-
-    Args:
-        generator: model of :func:`raydrop_model`.
-        simulated: simulated scans of the run's sensor, before and after drops.
-        real: real scans of its sensor.
-    """
+def scores_of_model(generator: Generator, simulated: SimulatedScans, real: RangeImages) -> list[CurveScore]:
+    """Score a model's drops: on simulated scans, whose clean ranges are known, and on real ones, estimated twice."""
     decoded, true = decoded_surfaces(generator, real)
     pairs = {
         "simulated": (simulated.clean, simulated.measured),
@@ -111,9 +105,6 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
     """Return scans with a decoded range for every ray, and the original scans.
 
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
-
-    Args:
-        real: scans of its sensor.
     """
     _check_tokenizer(generator)
     if not generator.sensor.same_rays(real.sensor):
@@ -134,9 +125,6 @@ def triangulated_surfaces(true: RangeImage) -> RangeImage:
     """Return scans with a range for every ray, interpolated from the returns of other rays.
 
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
-
-    Args:
-        true: batch of real scans.
     """
     return _surfaces(ranges_from_others(true, torch.Generator().manual_seed(0)).range_m, true)
 
@@ -144,25 +132,6 @@ def triangulated_surfaces(true: RangeImage) -> RangeImage:
 def _surfaces(range_m: Tensor, true: RangeImage) -> RangeImage:
     """Return clean scans of these ranges, with no surface where none of the true scans has a return."""
     return RangeImage.masked(range_m, true.return_mask.any(0).expand_as(true.return_mask), true.sensor)
-
-
-def raydrop_table(scores: Sequence[RaydropScore]) -> str:
-    """Return scores as lines for a terminal."""
-    lines = []
-    for scans in dict.fromkeys(score.scans for score in scores):
-        lines.append(f"{_TITLES[scans]:<28}{'model':>10}{'Bernoulli':>11}{'real v real':>13}")
-        for score in scores:
-            if score.scans == scans:
-                values = (
-                    f"{score.model.value:>10.4f}{score.bernoulli.value:>11.4f}{score.real_against_real.value:>13.4f}"
-                )
-                lines.append(f"{score.model.metric:<28}{values}")
-    return "\n".join(lines)
-
-
-def raydrop_json(scores: Sequence[RaydropScore]) -> list[dict[str, Any]]:
-    """Return scores with their curves for a file."""
-    return [asdict(score) for score in scores]
 
 
 def _check(generator: Generator) -> None:
@@ -175,7 +144,3 @@ def _check_tokenizer(generator: Generator) -> None:
     if "encode" not in generator.capabilities:
         got = f"{generator.public_name()!r}, which has no tokenizer to decode clean ranges by"
         raise ConfigError(got, "a model with one, such as pretrained", "name another model")
-
-
-def _only(images: RangeImage) -> Iterator[RangeImage]:
-    yield images

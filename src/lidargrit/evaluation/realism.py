@@ -10,6 +10,7 @@ import torch
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
+from lidargrit.core.table import Table
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -50,23 +51,31 @@ class SimulatedScans:
 
 @dataclass(frozen=True)
 class CurveScore:
-    """Jensen-Shannon distances, from 0 (alike) to 1, between one curve of real scans and those of other scans.
+    """Jensen-Shannon distances, from 0 (alike) to 1, of one curve of true scans from that of other scans.
 
     Args:
-        simulated: distance between simulated and real scans; simulated scans are the generated set of the result.
-        bernoulli: distance between real scans and clean simulated ranges from which returns are dropped with one
-            constant probability.
-        real_against_real: distance between the two halves of the real scans, which shows how much real scans differ.
+        own: distance of the simulated scans, or of those whose returns a model drops; they are the generated set of it.
+        bernoulli: distance of clean scans from which returns are dropped with one constant probability.
+        real_against_real: distance between the two halves of the true scans, which shows how much true scans differ.
+        scans: kind of the scans whose returns a model drops: ``simulated``; ``real``, with ranges that a tokenizer
+            decodes; or ``real_triangulated``, with ranges interpolated from other rays' returns. "" for no model.
     """
 
-    simulated: MetricResult
+    own: MetricResult
     bernoulli: MetricResult
     real_against_real: MetricResult
+    scans: str = ""
 
     @property
     def ratio(self) -> float:
-        """Distance of the simulator over that of independent drops: below 1 the simulator is nearer to real scans."""
-        return self.simulated.value / self.bernoulli.value if self.bernoulli.value > 0 else float("nan")
+        """Distance of the simulator or model over that of independent drops: below 1 it is nearer to true scans."""
+        return self.own.value / self.bernoulli.value if self.bernoulli.value > 0 else float("nan")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the distances with their curves."""
+        whose = {"scans": self.scans, "model": asdict(self.own)} if self.scans else {"simulated": asdict(self.own)}
+        beside = {"bernoulli": asdict(self.bernoulli), "real_against_real": asdict(self.real_against_real)}
+        return {**whose, **beside, "ratio": self.ratio}
 
 
 def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] = CURVES) -> list[CurveScore]:
@@ -75,30 +84,41 @@ def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] 
     Args:
         simulated: scans of the real ones' sensor, as many as wanted.
         real: real scans, at least two, in the order of their recording.
-        curves: names of metrics. ``reflectance_histogram`` is left out where a real scan has no reflectance.
     """
     _require_two(real)
     if not simulated.clean.sensor.same_rays(real.sensor):
         got, wanted = simulated.clean.sensor.name, real.sensor.name
         raise ConfigError(f"simulated scans of {got!r}", f"the rays of {wanted!r}", "simulate the sensor of the scans")
-    half = len(real) // 2
+    return score_curves(simulated.measured, simulated.clean, real, curves)
+
+
+def score_curves(
+    own: RangeImage, clean: RangeImage, true: RangeImages | RangeImage, curves: Sequence[str], scans: str = ""
+) -> list[CurveScore]:
+    """Compare true scans with others, and with independent drops of clean ones, curve by curve.
+
+    Args:
+        own: scans with drops.
+        clean: batch of range images in which every surface returns.
+        true: measured scans; ``reflectance_histogram`` is left out where one has no reflectance.
+        scans: kind of the scans that a model drops returns of; see :class:`CurveScore`.
+    """
+    half = len(true) // 2
     pixels, returned, reflects = 0, 0, True
-    for batch in _batches(real, 0, len(real)):
+    for batch in _batches(true, 0, len(true)):
         pixels, returned = pixels + batch.return_mask.numel(), returned + int(batch.return_mask.sum())
         reflects &= batch.reflectance is not None
-    independent = drop_independently(simulated.clean, returned / pixels)
-    scores = []
-    for name in curves:
-        if name == "reflectance_histogram" and not reflects:
-            continue
-        scores.append(
-            CurveScore(
-                distance(name, [simulated.measured], _batches(real, 0, len(real))),
-                distance(name, [independent], _batches(real, 0, len(real))),
-                distance(name, _batches(real, 0, half), _batches(real, half, len(real))),
-            )
+    independent = drop_independently(clean, returned / pixels)
+    return [
+        CurveScore(
+            distance(name, [own], _batches(true, 0, len(true))),
+            distance(name, [independent], _batches(true, 0, len(true))),
+            distance(name, _batches(true, 0, half), _batches(true, half, len(true))),
+            scans,
         )
-    return scores
+        for name in curves
+        if name != "reflectance_histogram" or reflects
+    ]
 
 
 def _require_two(real: RangeImages) -> None:
@@ -182,20 +202,16 @@ def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeIm
     return image(within), image(within & torch.from_numpy(seen.return_mask))
 
 
-def _batches(images: RangeImages, first: int, last: int) -> Iterator[RangeImage]:
+def _batches(images: RangeImages | RangeImage, first: int, last: int) -> Iterator[RangeImage]:
     for start in range(first, last, _BATCH):
-        yield images.batch(range(start, min(start + _BATCH, last)))
+        end = min(start + _BATCH, last)
+        yield images[start:end] if isinstance(images, RangeImage) else images.batch(range(start, end))
 
 
 def distance(
     name: str, generated: Sequence[RangeImage] | Iterator[RangeImage], real: Iterator[RangeImage]
 ) -> MetricResult:
-    """Return the distance of one curve of generated scans from that of real ones.
-
-    Args:
-        generated: batches of generated scans.
-        real: batches of real scans.
-    """
+    """Return the distance of one curve of generated scans from that of real ones."""
     metric = load_metric(name)()
     for batches, is_real in ((generated, False), (real, True)):
         for batch in batches:
@@ -204,20 +220,27 @@ def distance(
     return metric.compute()
 
 
-def as_json(scores: Sequence[CurveScore]) -> list[dict[str, Any]]:
-    """Return scores with their curves for a file."""
-    return [{**asdict(score), "ratio": score.ratio} for score in scores]
+_WHOSE = {  # scans of a score → head of the column of ``own``, and of the first column
+    "": ("simulated", "distance of real scans from"),
+    "simulated": ("model", "raydrop of simulated scans"),
+    "real": ("model", "... real scans, decoded"),
+    "real_triangulated": ("model", "... real, triangulated"),
+}
 
 
-def as_table(scores: Sequence[CurveScore]) -> str:
-    """Return scores as lines for a terminal."""
-    lines = [f"{'distance of real scans from':<28}{'simulated':>10}{'Bernoulli':>11}{'ratio':>8}{'real v real':>13}"]
-    for score in scores[:1]:
-        lines += [f"{'scans compared':<28}{_counts(score.simulated):>10}{_counts(score.real_against_real):>32}"]
-    for score in scores:
-        values = f"{score.simulated.value:>10.4f}{score.bernoulli.value:>11.4f}{score.ratio:>8.2f}"
-        lines.append(f"{score.simulated.metric:<28}{values}{score.real_against_real.value:>13.4f}")
-    return "\n".join(lines)
+def tables(scores: Sequence[CurveScore]) -> list[Table]:
+    """Return a table for each kind of scans, the simulator's first."""
+    found = []
+    for scans in dict.fromkeys(score.scans for score in scores):
+        of_kind = [score for score in scores if score.scans == scans]
+        whose, title = _WHOSE[scans]
+        first = of_kind[0]
+        rows = [("scans compared", _counts(first.own), "", "", _counts(first.real_against_real))]
+        for score in of_kind:
+            own, bernoulli, real = (f"{of.value:.4f}" for of in (score.own, score.bernoulli, score.real_against_real))
+            rows.append((score.own.metric, own, bernoulli, f"{score.ratio:.2f}", real))
+        found.append(Table((title, whose, "Bernoulli", "ratio", "real v real"), tuple(rows)))
+    return found
 
 
 def _counts(result: MetricResult) -> str:

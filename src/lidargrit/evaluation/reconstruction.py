@@ -1,78 +1,50 @@
 """Errors of a tokenizer's reconstructions: pairs of real and decoded range images → errors."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.table import Table
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.scans.types import RangeImage
 
 _BATCH = 16
+_OF_SCANS = ("abs_rel", "sq_rel_m", "scan_rmse_m", "rmse_log", "accuracy_1_25")  # means over scans
 _LEAST_M = 1e-3  # of a decoded range in a logarithm or a ratio: ours are longer, others' may be 0 or negative
 
 
-# The measures of monocular depth estimation (Eigen et al., Depth map prediction from a single image, NeurIPS 2014,
-# section 4), as LidarGRIT reports them for its first stage: in metres, and image by image.
-
-
-def abs_rel(
+def errors_of_scans(
     real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the mean of |decoded - real| / real over the returns of each image; NaN where it has none."""
-    return _mean_over_returns((decoded_range_m.double() - real_range_m).abs() / real_range_m, return_mask)
+) -> dict[str, Float64[Tensor, " B"]]:
+    """Return the measures of monocular depth estimation of each image, over its returns; NaN where it has none.
 
+    ``abs_rel`` is the mean of |decoded - real| / real, ``sq_rel_m`` that of (decoded - real)^2 / real, ``scan_rmse_m``
+    the root of the mean squared error in metres, ``rmse_log`` that of the natural logarithm of the range, and
+    ``accuracy_1_25`` the share of returns with max(decoded / real, real / decoded) < 1.25. The program counts all
+    pixels in the last while it trains and, as here, returns only when it reports.
 
-def sq_rel(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the mean of (decoded - real)^2 / real (metres) over the returns of each image; NaN where it has none."""
-    return _mean_over_returns((decoded_range_m.double() - real_range_m).square() / real_range_m, return_mask)
-
-
-def rmse(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the root of the mean squared error, in metres, over the returns of each image; NaN where it has none."""
-    return _mean_over_returns((decoded_range_m.double() - real_range_m).square(), return_mask).sqrt()
-
-
-def rmse_log(
-    real_range_m: Float[Tensor, "B H W"], decoded_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
-) -> Float64[Tensor, " B"]:
-    """Return the root of the mean squared error of ln(range) over the returns of each image; NaN where it has none."""
-    log_ratio = decoded_range_m.double().clamp(min=_LEAST_M).log() - real_range_m.double().log()
-    return _mean_over_returns(log_ratio.square(), return_mask).sqrt()
-
-
-def accuracy(
-    real_range_m: Float[Tensor, "B H W"],
-    decoded_range_m: Float[Tensor, "B H W"],
-    return_mask: Bool[Tensor, "B H W"],
-    power: int = 1,
-) -> Float64[Tensor, " B"]:
-    """Return the share of returns with max(decoded / real, real / decoded) < 1.25^power; NaN where there are none.
-
-    The program counts all pixels while it trains and, as here, returns only when it reports.
+    Source:
+        Eigen et al., Depth map prediction from a single image, NeurIPS 2014, section 4; in metres, and image by image,
+        as LidarGRIT reports them for its first stage.
     """
-    ratio = decoded_range_m.double().clamp(min=_LEAST_M) / real_range_m
-    return _mean_over_returns((torch.maximum(ratio, 1 / ratio) < 1.25**power).double(), return_mask)
-
-
-def _mean_over_returns(value: Float64[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]) -> Float64[Tensor, " B"]:
-    return torch.where(return_mask, value, 0.0).sum((1, 2)) / return_mask.sum((1, 2))
-
-
-_OF_SCANS = {  # field of the errors → measure of each image
-    "abs_rel": abs_rel,
-    "sq_rel_m": sq_rel,
-    "scan_rmse_m": rmse,
-    "rmse_log": rmse_log,
-    "accuracy_1_25": accuracy,
-}
+    real, apart = real_range_m.double(), decoded_range_m.double() - real_range_m
+    above = decoded_range_m.double().clamp(min=_LEAST_M)
+    ratio = above / real
+    means = {
+        "abs_rel": apart.abs() / real,
+        "sq_rel_m": apart.square() / real,
+        "scan_rmse_m": apart.square(),
+        "rmse_log": (above.log() - real.log()).square(),
+        "accuracy_1_25": (torch.maximum(ratio, 1 / ratio) < 1.25).double(),
+    }
+    found = {
+        name: torch.where(return_mask, of, 0.0).sum((1, 2)) / return_mask.sum((1, 2)) for name, of in means.items()
+    }
+    return {name: of.sqrt() if "rmse" in name else of for name, of in found.items()}
 
 
 @dataclass(frozen=True)
@@ -113,10 +85,11 @@ class ReconstructionErrors:
     accuracy_1_25: float
     num_scans: int
 
-    def as_table(self) -> str:
-        """Return a line for each error."""
-        lines = [f"{name:<22}{value:>10.4g}" for name, value in asdict(self).items()]
-        return "\n".join(["errors of reconstruction", *lines])
+    def table(self) -> Table:
+        """Return a row for each error."""
+        return Table(
+            ("errors of reconstruction", "value"), tuple((name, f"{of:.4g}") for name, of in vars(self).items())
+        )
 
 
 class ReconstructionScore:
@@ -127,7 +100,7 @@ class ReconstructionScore:
         # Counts of pixels: real and decoded ray drops as (real, decoded) = TT, FT, TF, FF.
         self._both = self._only_decoded = self._only_real = self._neither = 0
         self._absolute_m, self._squared_m2 = 0.0, 0.0
-        self._of_scans, self._scans_with_returns = torch.zeros(len(_OF_SCANS), dtype=torch.float64), 0
+        self._of_scans, self._scans_with_returns = torch.zeros((), dtype=torch.float64), 0
 
     def update(
         self, real: RangeImage, clean_range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]
@@ -162,13 +135,8 @@ class ReconstructionScore:
         self._num_scans += len(real)
         has_returns = returned.any((1, 2))
         pairs = real.range_m[has_returns], clean_range_m.detach()[has_returns], returned[has_returns]
-        self._of_scans = self._of_scans + torch.stack([measure(*pairs).sum() for measure in _OF_SCANS.values()])
+        self._of_scans = self._of_scans + torch.stack([of.sum() for of in errors_of_scans(*pairs).values()])
         self._scans_with_returns += int(has_returns.sum())
-
-    def merge(self, other: "ReconstructionScore") -> None:
-        """Take in what another process has gathered."""
-        for key, value in vars(other).items():
-            setattr(self, key, getattr(self, key) + value)
 
     def compute(self) -> ReconstructionErrors:
         """Return the errors over all pairs so far."""

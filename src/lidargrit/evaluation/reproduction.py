@@ -25,9 +25,6 @@ class PaperTable:
     """One table of the paper.
 
     Args:
-        title: title of the table.
-        protocol: name of the protocol that measures its scores.
-        data_set: name of the data set.
         train: split to train on; it shares no drive with ``val`` and ``test``, the splits of these names.
         images: settings that make the protocol's images of the data set's scans.
         small_images: settings that make images with fewer columns.

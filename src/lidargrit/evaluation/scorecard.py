@@ -7,11 +7,13 @@ from typing import Any
 from lidargrit.core.configuration import hints_of, rebuilt
 from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_json
+from lidargrit.core.table import Table
 from lidargrit.evaluation.intervals import Score, format_value
 from lidargrit.evaluation.verdict import Verdict, notes_on_floors, verdict
 
 _OF_OTHER_FORM = {"protocol", "samples", "reference", "scores"}  # in the file
 LEFT_OUT, NOT_APPLICABLE = "left out", "not applicable"
+_HEAD = ("metric", "variant", "score", "95 % interval", "real against real", "pixel statistics", "better", "scans")
 
 
 @dataclass(frozen=True)
@@ -19,9 +21,6 @@ class LeftOut:
     """A metric of the protocol that could not be computed.
 
     Args:
-        metric: name of the metric.
-        variant: variant of the metric.
-        why: reason in one line.
         verdict: words in place of the number: ``left out``, or ``not applicable`` to sets of this kind.
     """
 
@@ -37,10 +36,6 @@ class EvalSetRecord:
 
     Args:
         data_set: name of the data set; "samples" for generated scans.
-        split: name of the split.
-        scans: number of scans of the set.
-        scans_used: number of scans that were compared.
-        projection: description of the projection of its scans.
         sha256: hash of the pixels that were compared.
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
     """
@@ -61,12 +56,9 @@ class Scorecard:
     """Result of an evaluation.
 
     Args:
-        protocol: name of the protocol.
         about: title, source, limits of range, number of scans, data set and departures of the protocol.
         samples: record of the first set, usually generated.
         reference: record of the second set, usually real.
-        scores: scores in the protocol's order.
-        left_out: metrics that could not be computed.
         deviations: differences of this evaluation from the protocol.
         warnings: sentences that a reader must know before trusting a score.
         settings: settings of the evaluation, as :meth:`EvalConfig.facts` returns them.
@@ -152,35 +144,24 @@ class Scorecard:
 
     def as_table(self) -> str:
         """Return the scores as lines for a terminal: the verdict in words, then the numbers."""
-        with_pixels = any(score.pixel_statistics is not None for score in self.scores)
-        pixels = ("pixel statistics",) if with_pixels else ()
-        head = ("metric", "variant", "score", "95 % interval", "real against real", *pixels, "better", "scans")
-        cells = [head, *(_row(score, with_pixels) for score in self.scores)]
-        cells += [(each.metric, each.variant or "-", each.verdict, *[""] * (len(head) - 3)) for each in self.left_out]
-        widths = [max(len(row[column]) for row in cells) for column in range(len(head))]
-        rows = [
-            "  ".join(
-                text.rjust(width) if 2 <= column < len(head) - 2 else text.ljust(width)
-                for column, (text, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in cells
-        ]
-        lines = [*self.verdict.sentences, "", *rows, *notes_on_floors(self.scores)]
-        lines += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
-        lines += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
-        return "\n".join(lines)
+        rows = [_row(score) for score in self.scores]
+        rows += [(each.metric, each.variant or "-", each.verdict, *[""] * 5) for each in self.left_out]
+        notes = notes_on_floors(self.scores)
+        notes += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
+        notes += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
+        table = Table(_HEAD, tuple(rows), sentences=(*self.verdict.sentences, ""), notes=tuple(notes))
+        return table.without_empty("pixel statistics").as_text()
 
 
-def _row(score: Score, with_pixels: bool) -> tuple[str, ...]:
+def _row(score: Score) -> tuple[str, ...]:
     result, interval, real = score.result, score.interval, score.real_against_real
-    pixels = score.pixel_statistics
     return (
         result.metric,
         result.variant,
         format_value(result.value),
-        f"{format_value(interval.low)} .. {format_value(interval.high)}" if interval else "-",
-        f"{format_value(real.value)} (n={real.num_scans})" if real else "-",
-        *(("-" if pixels is None else format_value(pixels),) if with_pixels else ()),
+        f"{format_value(interval.low)} .. {format_value(interval.high)}" if interval else "",
+        f"{format_value(real.value)} (n={real.num_scans})" if real else "",
+        "" if score.pixel_statistics is None else format_value(score.pixel_statistics),
         "higher" if result.higher_is_better else "lower",
         f"{result.num_generated} v {result.num_reference}",
     )

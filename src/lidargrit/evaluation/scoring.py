@@ -1,11 +1,13 @@
 """Two sets and a list of metrics → scores with intervals and reference rows; shared features are computed once."""
 
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
@@ -13,19 +15,16 @@ from lidargrit.core.errors import DataError, LidarGritError, ScanError
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.metrics import Metric, WholeImages, load_metric, update_together
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
-from lidargrit.evaluation.pixel_statistics import pixel_statistics
 from lidargrit.evaluation.protocols import MetricChoice
+from lidargrit.scans.types import RangeImage
 
 _BATCH = 16
+_PIXELS_AT_ONCE = 1 << 24  # shuffled in memory: 1,024 scans of 64x256
 
 
 @dataclass(frozen=True)
 class MetricFactory:
-    """Makes empty metrics of one definition.
-
-    Args:
-        choice: the metric with its variant.
-    """
+    """Makes empty metrics of one definition."""
 
     choice: MetricChoice
     seed: int = 0
@@ -83,10 +82,7 @@ class _FedMetric:
 
 
 def score_metrics(
-    factories: Sequence[MetricFactory],
-    pair: EvalPair,
-    resampling: Resampling,
-    with_pixel_statistics: bool = False,
+    factories: Sequence[MetricFactory], pair: EvalPair, resampling: Resampling, with_pixel_statistics: bool = False
 ) -> list[Score | LidarGritError]:
     """Score two sets by several metrics.
 
@@ -94,8 +90,6 @@ def score_metrics(
     computed once. All others are fed one after the other, so that only one's memory is held.
 
     Args:
-        factories: functions that make the metrics.
-        resampling: settings of the intervals and of real against real.
         with_pixel_statistics: whether each score gets that of pixel statistics, if there are four scans or more.
 
     Returns:
@@ -175,3 +169,26 @@ def _feed_pixel_statistics(
                 advance(len(fed) * len(batch))
         for each, metric in zip(fed, metrics, strict=True):
             each.pixel_statistics.append(Part(metric))
+
+
+def pixel_statistics(scans: EvalSet, indices: Sequence[int], seed: int) -> Iterator[RangeImage]:
+    """Shuffle each pixel among scans, independently of all other pixels; range, return and reflectance stay together.
+
+    Nothing is drawn twice: each pixel has exactly the values that it has in the scans, so that sets of independent
+    pixels score alike before and after.
+
+    Args:
+        indices: numbers of the scans to shuffle, at least two.
+
+    Yields:
+        batches of scans, as many in all as there are indices. Where they do not fit into memory at once, each batch
+        has scans from all over the set.
+    """
+    sensor = scans.images.sensor
+    at_once = max(2, _PIXELS_AT_ONCE // (sensor.height * sensor.width))
+    batches = max(1, len(indices) // at_once)
+    rng = torch.Generator().manual_seed(seed)
+    for first in range(batches):
+        images = scans.batch(indices[first::batches])
+        order = torch.rand(images.range_m.shape, generator=rng).argsort(dim=0)
+        yield images.mapped(lambda pixels: pixels.gather(0, order))  # noqa: B023 - called at once

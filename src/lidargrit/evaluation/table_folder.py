@@ -15,13 +15,7 @@ _CURE = "name the systems and settings once more: lidargrit compare OUT SYSTEM .
 
 
 def write_table(folder: Path, systems: Sequence[str], benchmark: Benchmark, scores: Sequence[Path]) -> None:
-    """Write ``table.json``, with every cell of the table; :func:`read_table` reads it.
-
-    Args:
-        systems: names of the systems, as the user gave them.
-        benchmark: settings that they share.
-        scores: file of scores of each system.
-    """
+    """Write ``table.json``, with every cell of the table; :func:`read_table` reads it."""
     settings = _settings(benchmark)
     write_json(folder / TABLE, {"systems": list(systems), "settings": settings, "cells": as_json(scores)})
 

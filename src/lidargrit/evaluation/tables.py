@@ -1,52 +1,56 @@
-"""Several systems side by side: files of scores → text, Markdown or LaTeX; published scores in blocks of their own."""
+"""Several systems side by side: files of scores → tables, and which system is better; published scores stand apart.
+
+The interval of a difference comes from the same half-samples as those of the two scores: in each, both systems were
+compared with the same half of the reference. The chance of the reference, which is common to both, cancels.
+"""
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from lidargrit.core.errors import DataError, printable
+from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_json, write_json
-from lidargrit.evaluation.differences import Comparison, compare_systems
-from lidargrit.evaluation.intervals import Score, format_value
+from lidargrit.core.table import Format, Table, render
+from lidargrit.evaluation.intervals import Estimate, Resampling, Score, blocks, format_value, spread_of
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
 from lidargrit.evaluation.verdict import (
+    ENOUGH,
     MEMORISED,
     PIXEL_STATISTICS,
     Column,
+    Tally,
+    Verdict,
     column_of,
+    names_of,
     notes_on_floors,
+    too_few,
     value_of_halves,
 )
 
 NamedCard = tuple[str, Scorecard]  # name of a system, and its scores
-Format = Literal["text", "markdown", "latex"]
 _BOUNDS = {PIXEL_STATISTICS: " (pixel statistics)", MEMORISED: " (memorised training scans)"}
+_NO_HALVES = "No verdict: without half-samples that both have in common (score both again, with the same settings)."
 
 
 @dataclass(frozen=True)
-class TableBlock:
-    """Rows that may be compared with one another.
+class Comparison:
+    """One system compared with another.
 
     Args:
-        title: title of the block.
-        columns: metrics and variants.
-        rows: name of a system with its scores, one for each column, "" where there is none.
-        notes: lines printed below the rows.
-        verdicts: lines printed above the rows, one for each system or pair of systems.
+        differences: score of the one minus that of the other, by metric and variant; the 95 % of the intervals are of
+            all metrics together, so that two equal systems seldom differ in any.
     """
 
-    title: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[str, tuple[str, ...]], ...]
-    notes: tuple[str, ...] = ()
-    verdicts: tuple[str, ...] = ()
+    differences: Mapping[Column, Estimate]
+    verdict: Verdict
 
 
-def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
+def side_by_side(paths: Sequence[Path]) -> list[Table]:
     """Set the scores of several files side by side.
 
     Rows share a block only if they were measured by one protocol against the very same reference. Published scores
@@ -56,12 +60,11 @@ def side_by_side(paths: Sequence[Path], form: Format = "text") -> str:
 
     Args:
         paths: files that ``lidargrit evaluate --json`` wrote.
-        form: format of the table.
     """
     if not paths:
         raise DataError("no file of scores", "at least one", "write some with: lidargrit evaluate ... --json FILE")
     measured = comparable([(name, Scorecard.read(path)) for path, name in zip(paths, _names(paths), strict=True)])
-    return render([block for cards in measured for block in (*_measured(cards), *_published(cards))], form)
+    return [table for cards in measured for table in (*_measured(cards), *_published(cards))]
 
 
 def comparable(cards: Sequence[NamedCard]) -> list[list[NamedCard]]:
@@ -81,14 +84,11 @@ def share_pixel_statistics(paths: Sequence[Path]) -> None:
                 write_json(Path(f"{name}.json"), card.to_json())
 
 
-def render(blocks: Sequence[TableBlock], form: Format = "text") -> str:
-    """Return blocks of a table, one below the other."""
-    return "\n\n".join(_RENDERERS[form](block) for block in blocks)
-
-
 def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict[str, Any]]:
     """Return the scores of several files side by side, and the content of each file by its name."""
-    return side_by_side(paths, form), {name: read_json(path) for path, name in zip(paths, _names(paths), strict=True)}
+    return render(side_by_side(paths), form), {
+        name: read_json(path) for path, name in zip(paths, _names(paths), strict=True)
+    }
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
@@ -109,12 +109,12 @@ class Judged:
     Args:
         cards: name and scores of each, with the pixel statistics of the row that holds them, if there is one.
         verdicts: a line for each system, and one for each compared with the first; none for the bounds.
-        differences: a block of these differences; none for a single system.
+        differences: a table of these differences; none for a single system.
     """
 
     cards: tuple[NamedCard, ...]
     verdicts: tuple[str, ...]
-    differences: tuple[TableBlock, ...]
+    differences: tuple[Table, ...]
 
 
 def judge(cards: Sequence[NamedCard]) -> Judged:
@@ -130,17 +130,21 @@ def judge(cards: Sequence[NamedCard]) -> Judged:
     return Judged(tuple(cards), (*said, *answers), (_differences(first, compared),))
 
 
-def _differences(first: str, compared: Sequence[tuple[str, Comparison]]) -> TableBlock:
+def _differences(first: str, compared: Sequence[tuple[str, Comparison]]) -> Table:
     columns = tuple(dict.fromkeys(each for _, of in compared for each in of.differences))
     rows = tuple(
-        (name, tuple(of.differences[each].as_text(".3g") if each in of.differences else "" for each in columns))
+        (name, *(of.differences[each].as_text(".3g") if each in of.differences else "" for each in columns))
         for name, of in compared
     )
     title = f"Differences: score minus that of {first}, with 95 % intervals that hold for all scores of a row together"
-    return TableBlock(title, columns, rows)
+    return Table(_head(columns), rows, title)
 
 
-def _measured(cards: Sequence[NamedCard]) -> tuple[TableBlock, ...]:
+def _head(columns: Iterable[Column]) -> tuple[str, ...]:
+    return "system", *(f"{metric} ({variant})" for metric, variant in columns)
+
+
+def _measured(cards: Sequence[NamedCard]) -> tuple[Table, ...]:
     judged = judge(cards)
     cards = judged.cards
     words = [{(each.metric, each.variant): each.verdict for each in _not_applicable(card)} for _, card in cards]
@@ -149,7 +153,7 @@ def _measured(cards: Sequence[NamedCard]) -> tuple[TableBlock, ...]:
     rows, notes = [], notes_on_floors(cards[0][1].scores)
     for (name, card), not_applicable in zip(cards, words, strict=True):
         cells = not_applicable | {column_of(score): _cell(score) for score in card.scores}
-        rows.append((f"{name}{_BOUNDS.get(_system(name), '')}", tuple(cells.get(column, "") for column in columns)))
+        rows.append((f"{name}{_BOUNDS.get(_system(name), '')}", *(cells.get(column, "") for column in columns)))
         missing = [each for each in card.left_out if each not in _not_applicable(card)]
         left_out = [f"left out: {each.metric} ({each.variant}): {each.why}" for each in missing]
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings, *left_out)]
@@ -162,15 +166,13 @@ def _measured(cards: Sequence[NamedCard]) -> tuple[TableBlock, ...]:
     }
     if reference_row:
         count = next(iter(reference_row.values())).num_scans
-        cells = tuple(
-            format_value(reference_row[column].value) if column in reference_row else "" for column in columns
-        )
-        rows.append((f"(real against real: halves of the reference, n = {count})", cells))
+        cells = (format_value(reference_row[column].value) if column in reference_row else "" for column in columns)
+        rows.append((f"(real against real: halves of the reference, n = {count})", *cells))
     title = (
         f"Measured, protocol {card.protocol}, {card.reference.scans_used:,} scans each, "
         f"against {card.reference.source} (sha256 {card.reference.sha256[:8]})"
     )
-    return TableBlock(title, tuple(columns), tuple(rows), tuple(notes), judged.verdicts), *judged.differences
+    return Table(_head(columns), tuple(rows), title, judged.verdicts, tuple(notes)), *judged.differences
 
 
 def _with_pixel_statistics(cards: Sequence[NamedCard]) -> list[NamedCard]:
@@ -197,21 +199,21 @@ def _not_applicable(card: Scorecard) -> list[LeftOut]:
     return [each for each in card.left_out if each.verdict == NOT_APPLICABLE]
 
 
-def _published(cards: Sequence[NamedCard]) -> list[TableBlock]:
+def _published(cards: Sequence[NamedCard]) -> list[Table]:
     """Return the published tables of the protocol, or why they do not compare."""
     tables = [table for table in published() if table["protocol"] == cards[0][1].protocol]
     if not tables:
         return []
     why = list(dict.fromkeys(text for _, card in cards for text in card.deviations))
     if why:
-        title = f"Published scores of {cards[0][1].protocol}"
-        return [TableBlock(title, (), (), (f"left out, for they do not compare: {'; '.join(why)}",))]
+        left_out = f"left out, for they do not compare: {'; '.join(why)}"
+        return [Table(title=f"Published scores of {cards[0][1].protocol}", notes=(left_out,))]
     return [
-        TableBlock(
+        Table(
+            _head((column["metric"], column["variant"]) for column in table["columns"]),
+            tuple((row["system"], *_printed(row["printed"], table["columns"])) for row in table["rows"]),
             f"Published, not measured here: {table['title']}",
-            tuple((column["metric"], column["variant"]) for column in table["columns"]),
-            tuple((row["system"], _printed(row["printed"], table["columns"])) for row in table["rows"]),
-            (f"source: {table['source']}", "these scores have neither an interval nor a real-against-real row"),
+            notes=(f"source: {table['source']}", "these scores have neither an interval nor a real-against-real row"),
         )
         for table in tables
     ]
@@ -239,49 +241,45 @@ def _cell(score: Score) -> str:
     )
 
 
-def _grid(block: TableBlock) -> list[list[str]]:
-    heads = ["system", *(f"{metric} ({variant})" for metric, variant in block.columns)]
-    rows = [heads, *([name, *(cell or "-" for cell in cells)] for name, cells in block.rows)]
-    return [[printable(text) for text in row] for row in rows]
+def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecard) -> Comparison:
+    """Compare one system with another, both scored by one protocol against the same scans."""
+    ours, theirs = ({column_of(score): score for score in each.scores} for each in (card, other))
+    asked = [*ours, *theirs, *((each.metric, each.variant) for each in (*card.left_out, *other.left_out))]
+    names, groups = names_of(asked), _groups_in_common(card, other)
+    shared = [each for each in ours if each in theirs]
+    differences = {each: _difference(ours[each], theirs[each], groups, len(shared)) for each in shared}
+    question = f"Is {name} better than {other_name}?"
+    why = too_few(card.reference.scans_used) if card.reference.scans_used < ENOUGH else ""
+    if why or all(math.isnan(of.low) for of in differences.values()):
+        return Comparison(differences, Verdict((), (f"{question} {why or _NO_HALVES}",)))
+    better, worse = (
+        [
+            names[each]
+            for each, of in differences.items()
+            if (of.low > 0 if ours[each].result.higher_is_better is wins else of.high < 0)
+        ]
+        for wins in (True, False)
+    )
+    answer = ("In part" if worse else "Yes") if better else ("No" if worse else "Undecided")
+    undecided = tuple(one for one in names.values() if one not in (*worse, *better))
+    tally = Tally(f"{question} {answer}", tuple(worse), tuple(better), undecided)
+    return Comparison(differences, Verdict((tally,), ()))
 
 
-def _as_text(block: TableBlock) -> str:
-    lines = [printable(text) for text in (block.title, *block.verdicts)]
-    if block.columns:
-        grid = _grid(block)
-        widths = [max(len(row[column]) for row in grid) for column in range(len(grid[0]))]
-        lines += ["  ".join(t.ljust(w) for t, w in zip(row, widths, strict=True)).rstrip() for row in grid]
-    return "\n".join([*lines, *map(printable, block.notes)])
+def _groups_in_common(card: Scorecard, other: Scorecard) -> int:
+    """Return of how many groups both took the same halves; 0 if they took others."""
+    ours, theirs = ((each.settings.get("resampling"), each.settings.get("seed")) for each in (card, other))
+    if ours != theirs:
+        return 0
+    groups = ours[0].get("groups") if isinstance(ours[0], dict) else Resampling.groups
+    return len(blocks(card.reference.scans_used, groups)) if isinstance(groups, int) and groups > 1 else 0
 
 
-def _as_markdown(block: TableBlock) -> str:
-    lines = [f"**{_marked(block.title)}**", "", *(f"- {_marked(each)}" for each in block.verdicts)]
-    lines += [""] if block.verdicts else []
-    if block.columns:
-        head, *rows = [[_marked(text) for text in row] for row in _grid(block)]
-        lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows)] + [""]
-    return "\n".join([*lines, *(f"- {_marked(note)}" for note in block.notes)]).rstrip()
-
-
-def _marked(text: str) -> str:
-    for sign in "\\`*_|<>[]":
-        text = text.replace(sign, "\\" + sign)
-    return " ".join(text.split())
-
-
-def _as_latex(block: TableBlock) -> str:
-    lines = [f"% {' '.join(text.split())}" for text in (block.title, *block.verdicts)]
-    if block.columns:
-        head, *rows = [" & ".join(_typeset(text) for text in row) + r" \\" for row in _grid(block)]
-        layout = "l" + "r" * len(block.columns)
-        lines += [rf"\begin{{tabular}}{{{layout}}}", r"\hline", head, r"\hline", *rows, r"\hline", r"\end{tabular}"]
-    return "\n".join([*lines, *(f"% {' '.join(note.split())}" for note in block.notes)])
-
-
-def _typeset(text: str) -> str:
-    signs = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    signs |= {sign: "\\" + sign for sign in "&%$#_{}"}
-    return " ".join("".join(signs.get(letter, letter) for letter in text).split())
-
-
-_RENDERERS = {"text": _as_text, "markdown": _as_markdown, "latex": _as_latex}
+def _difference(ours: Score, theirs: Score, groups: int, together: int) -> Estimate:
+    """Return one score minus another, with an interval where they have half-samples in common."""
+    value = ours.result.value - theirs.result.value
+    first, second = (each.interval.values if each.interval else () for each in (ours, theirs))
+    if not (groups > 1 and 1 < len(first) == len(second)):
+        return Estimate(value, math.nan, math.nan)
+    _, reach = spread_of([one - other for one, other in zip(first, second, strict=True)], groups, together)
+    return Estimate(value, value - reach, value + reach)

@@ -15,12 +15,15 @@ statistics from real scans: of one that does not, a good score says little. It i
 metric would have seen known damages of objects, with as many scans (:func:`.blind_to`).
 """
 
-from collections.abc import Container, Mapping, Sequence
+import csv
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Final
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import counted_scans
-from lidargrit.evaluation import sight
 from lidargrit.evaluation.intervals import Score, format_value
 from lidargrit.evaluation.metrics import load_metric
 
@@ -37,6 +40,10 @@ _WITHOUT_PIXELS = (
     "Pixel statistics, which any model has to beat, were not scored, so that no good score is counted (evaluate "
     "--pixel-statistics; marginal beside other systems)."
 )
+DEVIATIONS: Final = 2.8
+"""Standard deviations beyond which a difference is no chance: Student's 97.5 % quantile for five halvings."""
+
+_TABLE = "sight.csv"
 
 
 @dataclass(frozen=True)
@@ -109,12 +116,15 @@ def verdict(scores: Sequence[Score], scans: int, left_out: Sequence[Column] = ()
     if scans < ENOUGH:
         return Verdict((), (too_few(scans), *said), objects)
     by_pixels = {column_of(score): _standing(score, score.pixel_statistics) for score in scores}
-    by_real = {column_of(score): _standing(score, _real(score)) for score in scores}
+    by_real = {
+        column_of(score): _standing(score, real.value if (real := score.real_against_real) else None)
+        for score in scores
+    }
     seeing = {column_of(score) for score in scores if tells_apart(score)}
     tallies = []
     if known_pixels := any(stands is not None for stands in by_pixels.values()):
         tallies.append(_tally("Against pixel statistics", by_pixels, (-1,), seeing, names))
-    sharp = {column for column in seeing if sight.blind_to(*column, scans) == ()}
+    sharp = {column for column in seeing if blind_to(*column, scans) == ()}
     if any(stands is not None for stands in by_real.values()):
         tallies.append(_tally("Against real scans", by_real, (0, -1), sharp, names, "within noise"))
     if not tallies:
@@ -195,7 +205,7 @@ def tells_apart(score: Score) -> bool | None:
     real = score.real_against_real
     if score.pixel_statistics is None or real is None:
         return None
-    chance = noise(score) if real.spread is None else sight.DEVIATIONS * real.spread
+    chance = noise(score) if real.spread is None else DEVIATIONS * real.spread
     return _worse_by(score, score.pixel_statistics, real.value) > chance
 
 
@@ -220,10 +230,6 @@ def _standing(score: Score, bound: float | None) -> int | None:
     return int(by > noise(score)) - int(-by > noise(score))
 
 
-def _real(score: Score) -> float | None:
-    return None if score.real_against_real is None else score.real_against_real.value
-
-
 def _worse_by(score: Score, value: float, other: float) -> float:
     """Return by how much one value of a metric is worse than another one of the same metric."""
     return other - value if score.result.higher_is_better else value - other
@@ -241,3 +247,34 @@ def notes_on_floors(scores: Sequence[Score]) -> list[str]:
                 f"{metric} ({variant}) is not 0 for equal sets: {why}; its floor, real against real, is {floor}"
             )
     return notes
+
+
+def blind_to(metric: str, variant: str, scans: int) -> tuple[str, ...] | None:
+    """Return the damages that a metric would not have seen; None for a metric that was not measured.
+
+    The damages are ranges blurred over three columns, every second vehicle removed, and boxes in place of vehicles; of
+    streets of 64x256. What was seen with fewer scans is seen with more.
+
+    Args:
+        scans: number of scans of each set.
+    """
+    damages = _measured().get((metric, variant))
+    if damages is None:
+        return None
+    return tuple(name for name, fewest in damages.items() if fewest is None or fewest > scans)
+
+
+@cache
+def _measured() -> dict[tuple[str, str], dict[str, int | None]]:
+    """Return for each metric and variant the fewest scans with which each damage was seen; None if with none."""
+    found: dict[tuple[str, str], dict[str, int | None]] = {}
+    for row in sorted(_rows(), key=lambda row: int(row["scans"])):
+        damages = found.setdefault((row["metric"], row["variant"]), {})
+        if damages.setdefault(row["damage"], None) is None and float(row["deviations"]) > DEVIATIONS:
+            damages[row["damage"]] = int(row["scans"])
+    return found
+
+
+def _rows() -> Iterator[dict[str, str]]:
+    text = resources.files("lidargrit.evaluation").joinpath(_TABLE).read_text(encoding="utf-8")
+    yield from csv.DictReader(text.splitlines())

@@ -14,11 +14,10 @@ from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import WEIGHTS_FILE, Job, is_bundle, locate, named_folder
 from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
-from lidargrit.generation.bundle import Bundle
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import ConfigT, SavedModel, download, read_saved
+from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, download, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.bits import ScanBits

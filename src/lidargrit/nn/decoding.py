@@ -6,7 +6,9 @@ once, and residuals are added in place. In 32 bits the result is the transformer
 """
 
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Literal
 
@@ -16,8 +18,30 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.nn.threads import threads_for
 from lidargrit.nn.transformer import CausalTransformer
+
+_SHARED_FROM_FLOPS = 1e8  # a step of the packaged model for 8 scans has 6.7e7: two threads save it a tenth of its time
+
+
+@contextmanager
+def threads_for(step_flops: int) -> Iterator[None]:
+    """Compute with one thread meanwhile if steps are small and torch's threads spin while they wait for one another.
+
+    Beside other work a thread that spins takes the processor from the very thread that it waits for, a hundred times a
+    step. The command ``lidargrit`` lets threads sleep; other programs that load torch mostly do not, and OpenMP reads
+    its variables only once.
+    """
+    threads = torch.get_num_threads()
+    sleeps = os.environ.get("OMP_WAIT_POLICY", "").upper() == "PASSIVE"
+    if sleeps or threads == 1 or step_flops >= _SHARED_FROM_FLOPS:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
 
 WeightPrecision = Literal["fp32", "bf16", "int8"]
 SampleToken = Callable[[Tensor, Tensor], Tensor]

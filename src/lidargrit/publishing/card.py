@@ -35,8 +35,6 @@ def model_card(
     Args:
         about: content of its ``run.json``; empty if there is no such file.
         learned: recordings and images that it was trained on.
-        scores: scores of its samples, if there are any.
-        bits: bits of a stored parameter, 8, 16 or 32.
 
     Source:
         The head's entries are those of the hub's documentation, "Model cards".
@@ -138,7 +136,7 @@ def _leaks(name: str, split: str) -> list[str]:
 
 def _licence(about: dict[str, Any], licences: list[str]) -> str:
     lines = ["## Licence", ""]
-    if _has_imported(about):
+    if _imported(about) or taken_over(about)["files"]:  # or those that it began with
         whose = "The weights" if _imported(about) else "Some of the weights, or those that they were trained from,"
         lines.append(f"{whose} belong to their authors; ask them whether they may be used and passed on.")
     if any("non-commercial" in licence for licence in licences):
@@ -238,11 +236,6 @@ def _code(words: Any) -> str:
 
 def _imported(about: dict[str, Any]) -> bool:
     return bool(about.get("files"))
-
-
-def _has_imported(about: dict[str, Any]) -> bool:
-    """Return whether weights of the model, or those that it began with, were imported."""
-    return _imported(about) or bool(taken_over(about)["files"])
 
 
 def _licences(about: dict[str, Any]) -> list[str]:

@@ -2,13 +2,13 @@
 
 import copy
 import hashlib
+import importlib
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,9 @@ import torch
 
 from lidargrit.core import configuration, reporting
 from lidargrit.core.determinism import derive_seed
-from lidargrit.core.errors import CheckpointError, OutputError
+from lidargrit.core.errors import CheckpointError, ConfigError, OutputError
 from lidargrit.core.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
+from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.run_folder import RUN_FILE, TRAINED_ON_FILE, locate, preset_settings, trained_on, write_trained_on
@@ -30,7 +31,6 @@ from lidargrit.training.engine import Engine
 from lidargrit.training.plan import CheckedStages, OpenedData, check_stages, open_data
 from lidargrit.training.stage import StageTraining
 from lidargrit.training.taken_stages import taken_facts
-from lidargrit.training.tracking import tracked
 
 _IMAGES = "_images"  # of a hash of images, in place of their names
 # Settings of a preset that change nothing that is computed, the last two of each stage.
@@ -204,14 +204,7 @@ def _write_trained_on(folder: Path, train_images: RangeImages, donors: Iterable[
     if (folder / TRAINED_ON_FILE).exists():
         return
     learned = [train_images.provenance, *(trained_on(locate(donor)) for donor in sorted({*donors}))]
-    write_trained_on(
-        folder,
-        Provenance(
-            recordings=tuple(chain.from_iterable(each.recordings for each in learned)),
-            fingerprints=tuple(chain.from_iterable(each.fingerprints for each in learned)),
-            range_fingerprints=tuple(chain.from_iterable(each.range_fingerprints for each in learned)),
-        ),
-    )
+    write_trained_on(folder, Provenance.joined(learned))
 
 
 def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages) -> None:
@@ -228,3 +221,40 @@ def _commit() -> str:
         return done.stdout.partition("\n")[0]
     except (OSError, subprocess.SubprocessError):
         return "unknown"
+
+
+@contextmanager
+def tracked(project: str, preset: Preset, folder: Path) -> Iterator[None]:
+    """Send what is logged within the ``with`` block to a project on Weights & Biases; a resumed run is one run there.
+
+    Args:
+        project: name of the project; "" to send nothing.
+    """
+    if not project or rank_and_world_size(None, None)[0] > 0:  # of several processes the first one logs
+        yield
+        return
+    wanted, cure = "the package wandb", "pip install 'lidargrit[wandb]', or leave --wandb out"
+    try:
+        wandb = importlib.import_module("wandb")  # an extra: nothing else needs it
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        run = wandb.init(
+            project=project,
+            name=folder.name,
+            id=hashlib.sha256(str(folder.resolve()).encode()).hexdigest()[:16],
+            resume="allow",
+            config=configuration.to_json(preset),
+            dir=folder.parent,
+            sync_tensorboard=True,
+        )
+    except ImportError:
+        raise ConfigError(f"--wandb {project}, and no wandb", wanted, cure) from None
+    except Exception as error:  # its client has many kinds, from a missing key to a broken line, and changes them
+        reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0][:100]}"
+        cure = "log in with: wandb login, or set WANDB_MODE=offline"
+        raise ConfigError(f"--wandb {project}, where {reason}", "a project that can be written to", cure) from None
+    failed = 1
+    try:
+        yield
+        failed = 0
+    finally:
+        run.finish(exit_code=failed)

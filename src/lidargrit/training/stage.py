@@ -3,11 +3,13 @@
 import math
 import os
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Self
 
 import torch
@@ -30,7 +32,40 @@ from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
 from lidargrit.training.engine import Engine
 from lidargrit.training.log import Log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser
-from lidargrit.training.termination import Termination
+
+
+class Termination:
+    """Within its ``with`` block, a SIGTERM makes ``asked`` true and does not end the process.
+
+    Batch schedulers send this signal some seconds before they kill. Python lets only the main thread handle signals;
+    in other threads the block changes nothing.
+
+    Args:
+        deadline_s: value of ``time.monotonic()`` from which on ``asked`` is true without a signal.
+    """
+
+    def __init__(self, deadline_s: float = math.inf) -> None:
+        self._signalled, self._deadline_s = False, deadline_s
+
+    @property
+    def asked(self) -> bool:
+        """Whether training is to stop after the step in progress."""
+        return self._signalled or time.monotonic() >= self._deadline_s
+
+    def __enter__(self) -> "Termination":
+        try:
+            self._before = signal.signal(signal.SIGTERM, self._note)
+        except ValueError:  # not the main thread
+            self._before = None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._signalled = True
+
 
 _LOG_EVERY_STEPS = 20
 

@@ -15,7 +15,7 @@ from lidargrit.core.files import atomic_path
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
+_DOTS_PER_INCH = 100  # 1400 pixels across: a laptop shows the picture without shrinking it
 
 if "matplotlib" not in sys.modules:
     _current = os.open(".", os.O_RDONLY)
@@ -35,4 +35,4 @@ def write_png(figure: "Figure", path: Path) -> None:
     """
     with atomic_path(path) as unfinished, warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing from")
-        figure.savefig(unfinished, format="png", dpi=DOTS_PER_INCH)
+        figure.savefig(unfinished, format="png", dpi=_DOTS_PER_INCH)

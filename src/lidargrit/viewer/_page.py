@@ -3,13 +3,38 @@
 import base64
 import hashlib
 from html import escape
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from lidargrit.evaluation.intervals import format_value
+
+_TEMPLATES = Environment(
+    loader=PackageLoader("lidargrit.viewer"),
+    autoescape=True,  # names of files and other foreign text are no HTML
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_TEMPLATES.filters["value"] = format_value
+
+
+def asset(name: str) -> str:
+    """Return a style sheet or a script of ``browser/``; none names a file, or a font that a computer may lack."""
+    return (Path(__file__).parent / "browser" / name).read_text(encoding="utf-8")
+
+
+def part(template: str, **values: Any) -> Markup:
+    """Return a part of a page: one of ``templates/`` with these values, escaped unless they are ``Markup``."""
+    return Markup(_TEMPLATES.get_template(template).render(values))
 
 
 def document(title: str, style: str, content: str, script: str = "", scans: str = "", images: str = "") -> str:
     """Return a whole page, which fetches nothing and runs no other script, whatever a name in it may hold.
 
     Args:
-        title: title of the page, as text.
         style: style sheets.
         content: HTML of the page.
         script: the one script that may run; none if empty.
@@ -32,15 +57,3 @@ def _policy(script: str, images: str) -> str:
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     rules = ["default-src 'none'", *([f"img-src {images}"] if images else []), "style-src 'unsafe-inline'"]
     return "; ".join([*rules, *([f"script-src 'sha256-{digest}'"] if script else [])])
-
-
-def figure(picture: str, caption: str, spoken: str = "") -> str:
-    """Return a picture with its caption.
-
-    Args:
-        picture: data URI of the picture.
-        caption: text below it.
-        spoken: words for those who do not see the picture; the caption if empty.
-    """
-    alt = escape(spoken or caption)
-    return f'<figure><img src="{picture}" alt="{alt}"><figcaption>{escape(caption)}</figcaption></figure>'

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.gridspec import GridSpec, SubplotSpec
@@ -14,7 +13,7 @@ from matplotlib.ticker import NullFormatter, ScalarFormatter
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.evaluation.realism import CurveScore
-from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
+from lidargrit.viewer._matplotlib import write_png
 
 _WIDTH, _ROW, _HEAD = 14.0, 3.4, 0.6  # inches: the picture, a row of panels, the title
 _SIDES = {
@@ -31,9 +30,6 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
     Curves with two axes, such as a histogram for every row, get one image for each of the three, and the mean over
     rows where rows are of one kind.
-
-    Args:
-        title: title of the whole picture.
     """
     if not scores:
         raise ConfigError("no curve", "at least one", "compare some scans first")
@@ -41,8 +37,7 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
     deep = [score for score in scores if _curve(score, "real").ndim == 2]
     rows = -(-len(flat) // 2) + len(deep)
     height = _HEAD + _ROW * rows
-    figure = Figure(figsize=(_WIDTH, height), dpi=DOTS_PER_INCH)
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(_WIDTH, height))
     grid = GridSpec(
         rows, 2, figure, left=0.06, right=0.98, top=1 - (_HEAD + 0.35) / height, bottom=0.55 / height,
         hspace=0.6, wspace=0.16,
@@ -56,18 +51,18 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
 
 
 def _curve(score: CurveScore, which: str) -> Float64[np.ndarray, "*rows n"]:
-    result = score.bernoulli if which == "Bernoulli" else score.simulated
+    result = score.bernoulli if which == "Bernoulli" else score.own
     return np.array(result.details["real" if which == "real" else "generated"], dtype=float)
 
 
 def _title(score: CurveScore) -> str:
-    name = score.simulated.metric.replace("_", " ")
-    distances = f"simulated {score.simulated.value:.3f}, Bernoulli {score.bernoulli.value:.3f}"
+    name = score.own.metric.replace("_", " ")
+    distances = f"simulated {score.own.value:.3f}, Bernoulli {score.bernoulli.value:.3f}"
     return f"{name}\ndistance of real from {distances}, real {score.real_against_real.value:.3f}"
 
 
 def _plot_lines(axes: Axes, score: CurveScore) -> None:
-    details = score.simulated.details
+    details = score.own.details
     axis, label = np.array(details["axis"], dtype=float), details["axis_label"]
     lags = axis[0] < 0  # rows and columns share the axis: no line of numbers
     for which, colour in _SIDES.items():
@@ -94,10 +89,10 @@ def _log_axis(axes: Axes) -> None:
 
 def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
     """Plot the three images on one scale, with the mean over rows beside them where rows share an axis."""
-    details = score.simulated.details
+    details = score.own.details
     axis = np.array(details["axis"], dtype=float)
     images = {which: _curve(score, which) for which in _SIDES}
-    is_map = score.simulated.metric in _MAPS
+    is_map = score.own.metric in _MAPS
     grid = cell.subgridspec(1, 4, wspace=0.25)
     norm = PowerNorm(0.5, 0, np.nanmax([np.nanmax(image, initial=0) for image in images.values()]) or 1)
     for index, (which, image) in enumerate(images.items()):

@@ -6,8 +6,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import torch
-
 from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.determinism import evenly_spaced
@@ -15,28 +13,24 @@ from lidargrit.core.errors import CheckpointError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import PRETRAINED, RUN_FILE, locate, read_config
-from lidargrit.data.sources import load_range_images
+from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
-from lidargrit.evaluation.reconstruction import ReconstructionErrors, score_reconstruction
+from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import Generator
-from lidargrit.generation.pixel_decoder.pixel_phases import completed_lattices
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
 from lidargrit.inference.samples import write_samples
 from lidargrit.nn.devices import usable_device
-from lidargrit.nn.random import rngs_of
-from lidargrit.scans.types import RangeImage
-from lidargrit.systems.lidargrit.system import LidarGrit, TokenSampling
+from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.training import check_folder, train
 from lidargrit.training.fine_tuning import divided
 from lidargrit.training.log import LOG_FILE, read_log
 from lidargrit.training.measure import measure
 from lidargrit.viewer import plot_comparison
-from lidargrit.viewer.demo_page import DemoPage, write_demo_page
-from lidargrit.viewer.scan_sets import ScanSet
+from lidargrit.viewer.demo_page import DemoPage, reconstructed, write_demo_page
 
 PAGE, PICTURE, TIMINGS = "demo.html", "scans_reconstructed_generated.png", "timings.json"
 _NUM_SAMPLES = 32
@@ -47,7 +41,6 @@ _SIMULATED_S, _READ_S, _SAMPLED_S, _SCORED_S = 0.3, 0.1, 1.2, 0.8
 _SHARPER = TokenSampling(range_temperature=0.1, range_noise=0.2)
 _DEFAULT = TokenSampling()
 _STAGES = {"tokenizer": "the tokenizer", "transformer": "the transformer", "pixels": "the pixel decoder"}
-_SCANS_OF_A_SET = 6  # of each set on the page: enough to step through, and half a megabyte each
 
 
 def demo(data: str | None, folder: Path, settings: list[str], anew: bool = False) -> Path:
@@ -104,8 +97,9 @@ def demo(data: str | None, folder: Path, settings: list[str], anew: bool = False
     kind = "real" if data else "simulated"
     _plot_pictures(generator, kind, val, samples, sampling, folder)
     scans = f"{len(real):,} {kind} scans to learn from and {len(val):,} held out, of the sensor {generator.sensor.name}"
-    results = reconstruction, card, clock.seconds, _facts(preset, generator, scans), folder
-    write_results_page(generator, kind, real, val, samples, *results, sampling)
+    facts = _facts(preset, generator, scans)
+    page = DemoPage(generator, kind, real, val, samples, reconstruction, card, clock.seconds, facts, folder, sampling)
+    write_demo_page(page, folder / PAGE)
     return folder
 
 
@@ -143,73 +137,6 @@ def how_trained(preset: Preset) -> str:
     return " ".join(said)
 
 
-def write_results_page(
-    generator: Generator,
-    kind: str,
-    real: RangeImages,
-    val: RangeImages,
-    samples: RangeImages,
-    errors: ReconstructionErrors,
-    card: Scorecard,
-    seconds: dict[str, float],
-    facts: tuple[str, ...],
-    folder: Path,
-    sampling: TokenSampling = _DEFAULT,
-) -> None:
-    """Write the page ``demo.html`` into a run's folder.
-
-    Args:
-        kind: kind of the scans: "real" or "simulated".
-        real: training scans, of which the nearest to each new scan stands beside it.
-        val: held-out scans; the page follows the first of them.
-        samples: scans that the generator sampled.
-        card: scores of the samples against held-out scans, with real against real and pixel statistics.
-        seconds: time that each stage took, in seconds, by its name.
-        facts: short sentences about the model and its training.
-        sampling: settings by which pixels of reconstructed scans are sampled, as those of ``samples`` were.
-    """
-    tokenizer, held_out = generator.get_tokenizer(), val.batch([0])
-    new = samples.batch(range(min(_SCANS_OF_A_SET, len(samples))))
-    with torch.no_grad():
-        tokens = tokenizer.encode(held_out)
-        decoded = tokenizer.decode(tokens)
-        sampled = tokenizer.sample(tokens, rngs_of([0]))
-        by_phases, lattices = None, []
-        if isinstance(generator, LidarGrit) and generator.pixels is not None:
-            by_phases = _reconstructed(generator, held_out, sampling)
-            lattices = completed_lattices(generator.pixels.mask.phases)
-    nearest = _nearest(new, real)
-    sets = [
-        ScanSet("new", new, tuple(f"seed {seed}" for seed in range(len(new))), generated=True),
-        ScanSet(f"nearest {kind} scan of training", real.batch(nearest), tuple(_name(real, one) for one in nearest)),
-    ]
-    results = errors, card, seconds, facts, folder
-    write_demo_page(
-        DemoPage(kind, _name(val, 0), held_out, tokens, decoded, sampled, by_phases, lattices, sets, *results),
-        folder / PAGE,
-    )
-
-
-def _name(images: RangeImages, index: int) -> str:
-    return images.provenance.names[index].rpartition("/")[2]
-
-
-def _nearest(new: RangeImage, real: RangeImages) -> list[int]:
-    """Return for each new scan the index of the real one whose logarithms of range differ least from its own."""
-    logs = new.range_m.log1p()
-    differences = [(logs - real.batch([index]).range_m.log1p()).abs().mean((1, 2)) for index in range(len(real))]
-    return torch.stack(differences).argmin(0).tolist()
-
-
-def _reconstructed(generator: Generator, images: RangeImage, sampling: TokenSampling) -> RangeImage:
-    """Return scans decoded from the tokens of others just as those of new scans are, with sampled return masks."""
-    tokenizer = generator.get_tokenizer()
-    tokens, rngs = tokenizer.encode(images), rngs_of(range(len(images)))
-    if isinstance(generator, LidarGrit) and generator.pixels is not None:
-        return generator.pixels.sample(tokenizer.decode(tokens), rngs, sampling.pixels())
-    return tokenizer.sample(tokens, rngs)
-
-
 def _preset(data: str | None, settings: list[str], anew: bool) -> Preset:
     """Return the preset that suits the scans: from the model in the package, if that is wanted and has their rays."""
     config = None if data is None else divided(data, _MAX_SCANS)
@@ -237,18 +164,15 @@ def _sampling(preset: Preset) -> TokenSampling:
 
 def _expected_s(preset: Preset, simulates: bool) -> dict[str, float]:
     """Return the expected time of each long step of the demo, in seconds; that of training from steps timed here."""
-    scans = sum(_count_of(source) for source in (*preset.data.train, *preset.data.val)) if simulates else _MAX_SCANS
+    scans = _MAX_SCANS
+    if simulates:
+        scans = sum(len(open_source(source).scans()) for source in (*preset.data.train, *preset.data.val))
     return {
         "projecting scans": scans * (_SIMULATED_S if simulates else _READ_S),
         **{f"training {stage.stage}": stage.seconds for stage in measure(preset)},
         "sampling": _NUM_SAMPLES * _SAMPLED_S,
         "scoring": _NUM_SAMPLES * _SCORED_S,
     }
-
-
-def _count_of(source: str) -> int:
-    """Return the number of scans of a source such as ``simulated:96:train``."""
-    return next((int(part) for part in source.split(":") if part.isdigit()), 0)
 
 
 def _score(samples: RangeImages, val: RangeImages) -> Scorecard:
@@ -313,7 +237,7 @@ def _plot_pictures(
     real = val.batch(evenly_spaced(3, len(val)))
     title = f"{kind} scans never trained on, what the tokens keep of them, and new scans"
     plot_comparison(
-        {kind: real, "reconstructed": _reconstructed(generator, real, sampling), "generated": samples.batch(range(3))},
+        {kind: real, "reconstructed": reconstructed(generator, real, sampling), "generated": samples.batch(range(3))},
         folder / PICTURE,
         title=title,
     )

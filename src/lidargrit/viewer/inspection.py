@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import BoundaryNorm, ListedColormap, LogNorm
 from matplotlib.figure import Figure
 
 from lidargrit.scans.projection.inspection import FATES, Inspection
 from lidargrit.scans.projection.pixel_coordinates import row_elevation_rad
 from lidargrit.scans.projection.sensor_check import elevations_deg
-from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
+from lidargrit.viewer._matplotlib import write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
 
 _COLOURS = {
@@ -29,13 +28,8 @@ _DOTS_AT_MOST = 20_000  # of one kind in a view; more hide one another and take 
 
 
 def plot_inspection(inspection: Inspection, path: Path) -> None:
-    """Plot which points collide, which are lost, and their elevations beside the sensor's rows.
-
-    Args:
-        inspection: result of inspecting one scan.
-    """
-    figure = Figure(figsize=(14, 11), dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
+    """Plot which points collide, which are lost, and their elevations beside the sensor's rows."""
+    figure = Figure(figsize=(14, 11), layout="constrained")
     panels = figure.subplot_mosaic(
         [["range"] * 3, ["collisions"] * 3, ["above", "side", "rows"]], height_ratios=[1, 1, 2.4]
     )

@@ -8,14 +8,13 @@ a cloud that have no pixel in its image follow with their coordinates. Scripts a
 import base64
 import gzip
 import json
-import re
-from collections.abc import Sequence
-from html import escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from markupsafe import Markup
 from matplotlib import colormaps
 from torch import Tensor
 
@@ -25,12 +24,11 @@ from lidargrit.core.version import __version__
 from lidargrit.scans.classes import CLASS_BITS, names_and_colours
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import Scan
-from lidargrit.viewer._page import document
+from lidargrit.viewer._page import asset, document, part
 from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
 
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
-_FOLDER = Path(__file__).parent / "browser"
 _SCRIPTS = ("scans.js", "camera.js", "points.js", "files.js", "pane.js", "page.js")  # of every page that shows scans
 _RANGE_STEPS = 65_535  # 16 bits, of which 0 is no return
 _CLASSES_AT_MOST = 255  # 8 bits; SemanticKITTI has 34
@@ -77,18 +75,18 @@ def page(sets: Sequence[ScanSet]) -> str:
     coarsest_m = max(_far_m(scans) for scans in sets) / _RANGE_STEPS
     precision = f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. Written by lidargrit {__version__}."
     title = f"Scans: {', '.join(scans.name for scans in sets)}"
-    content = viewer_html("<h1>Scans</h1>", button("bin", "Save .bin") + button("ply", "Save .ply"), precision)
+    content = viewer_html({"bin": "Save .bin", "ply": "Save .ply"}, precision, heading="Scans")
     return document(title, style(), content, opening_script(), as_json(sets), "data: blob:")
 
 
 def scripts() -> str:
     """Return the scripts of every page that shows scans; ``new Page`` starts them."""
-    return '"use strict";\n' + "\n".join(_read(name) for name in _SCRIPTS) + "\n"
+    return '"use strict";\n' + "\n".join(asset(name) for name in _SCRIPTS) + "\n"
 
 
 def opening_script() -> str:
     """Return the script of a page that holds its scans itself, as JSON in the element ``scans``."""
-    return scripts() + _read("open.js")
+    return scripts() + asset("open.js")
 
 
 def as_json(sets: Sequence[ScanSet]) -> str:
@@ -98,32 +96,19 @@ def as_json(sets: Sequence[ScanSet]) -> str:
 
 def style() -> str:
     """Return the style sheet of such a page."""
-    return _read("page.css")
+    return asset("page.css")
 
 
-def viewer_html(heading: str, buttons: str, note: str) -> str:
+def viewer_html(buttons: Mapping[str, str], note: str, label: str = "", heading: str = "") -> Markup:
     """Return the elements that the scripts use: controls, a legend, room for scans, and instructions.
 
     Args:
-        heading: HTML before the controls.
-        buttons: HTML of the buttons of each set of scans.
+        buttons: words of the buttons of each set of scans, by their names in the scripts.
         note: last sentence of the instructions.
+        label: word before the buttons.
+        heading: heading before the controls.
     """
-    return filled(_read("viewer.html"), {"heading": heading, "buttons": buttons, "precision": note})
-
-
-def button(part: str, words: str) -> str:
-    """Return a button of a set of scans; ``part`` is its name in the scripts."""
-    return f'<button type="button" data-part="{part}">{escape(words)}</button>'
-
-
-def filled(text: str, parts: dict[str, str]) -> str:
-    """Return a template in which each name in double braces is replaced by its part."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], text)
-
-
-def _read(name: str) -> str:
-    return (_FOLDER / name).read_text(encoding="utf-8")
+    return part("viewer.html", buttons=buttons.items(), note=note, label=label, heading=heading)
 
 
 def page_data(sets: Sequence[ScanSet]) -> dict[str, Any]:
@@ -152,9 +137,9 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
     numbers = _numbers_of_classes(scan_set)
     named = names_and_colours(numbers)
     scans: list[dict[str, Any]] = []
-    for index, (name, hidden) in enumerate(zip(scan_set.scan_names, scan_set.hidden(), strict=True)):
-        image = images[index]
-        beside = scan_set.beside[index] if scan_set.shows_beside and scan_set.beside else None
+    for index, name in enumerate(scan_set.scan_names):
+        image, beside = images[index], scan_set.beside[index] if scan_set.beside else None
+        hidden = scan_set.hidden[index] if scan_set.hidden else 0
         steps = (image.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * image.return_mask
         scan = {"name": name, "range": _packed(steps.numpy().astype("<u2")), "hidden": hidden}
         if beside is not None:

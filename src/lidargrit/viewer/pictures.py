@@ -1,23 +1,28 @@
 """Range images side by side as a picture: groups of range images → one PNG."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError
+from lidargrit.data.images import RangeImages
+from lidargrit.generation.generator import Generator
+from lidargrit.scans.condition import Nothing
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
-from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
+from lidargrit.viewer._matplotlib import write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
 from lidargrit.viewer.scan_sets import SURPRISED_BITS
 
@@ -26,14 +31,13 @@ _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one 
 _TICKS_AT_LEAST, _TICKS_AT_MOST = 3, 6  # of elevation: enough to read a row's by, and words that do not overlap
 _FILLED, _FILLED_NOTE = "#e8730c", "\norange = filled in by a model"
 _SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
+_SCANS = 2  # a glance; more would take training's time
 
 
 def plot_comparison(
     groups: dict[str, RangeImage],
     path: Path,
-    max_range_m: float | None = None,
     title: str = "",
-    labels: list[str] | None = None,
     surprise: dict[str, Float[Tensor, "B H W"]] | None = None,
     filled: dict[str, Bool[Tensor, "B H W"]] | None = None,
 ) -> None:
@@ -44,31 +48,21 @@ def plot_comparison(
 
     Args:
         groups: range images by name ("real", "reconstructed", ...), each one or a batch of 1 to 8; sensors may differ.
-        max_range_m: end of the range scale and of the bird's-eye view, in metres; None for the farthest return.
-        title: title of the whole picture.
-        labels: names of the scans; "scan 1", ... if not given.
         surprise: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
             :meth:`lidargrit.scans.types.ScanBits.surprise`.
         filled: True for pixels whose point a model filled in, by group; they have another colour in the return mask and
             in the bird's-eye view.
     """
-    _check(groups, max_range_m)
+    _check(groups)
     rows = [(index, name) for index in range(max(map(len, groups.values()))) for name in groups]
-    rows = [(index, name) for index, name in rows if index < len(groups[name])]
-    labels = labels or [f"scan {index + 1}" for index in range(rows[-1][0] + 1)]
-    if len(labels) <= rows[-1][0]:
-        raise ConfigError(f"{len(labels)} labels", f"one for each of {rows[-1][0] + 1} scans", "give more labels")
-    panels = [_panel(groups[name], index, f"{labels[index]}: {name}") for index, name in rows]
-    if surprise is not None:
-        bits = [surprise[name][index].detach().cpu().numpy() for index, name in rows]
-        panels = [replace(panel, surprise=each) for panel, each in zip(panels, bits, strict=True)]
-    for at, (index, name) in enumerate(rows):
-        if filled and name in filled:
-            panels[at] = replace(panels[at], filled=filled[name][index].cpu().numpy())
-    scales = _Scales.of(panels, max_range_m)
+    panels = [
+        _panel(groups[name], index, name, (surprise or {}).get(name), (filled or {}).get(name))
+        for index, name in rows
+        if index < len(groups[name])
+    ]
+    scales = _Scales.of(panels)
     height = _HEAD * bool(title) + _ROW * len(panels) + _FOOT
-    figure = Figure(figsize=(_WIDTH, height), dpi=DOTS_PER_INCH)
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(_WIDTH, height))
     if title:
         figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17, parse_math=False)
     for row, panel in enumerate(panels):
@@ -94,33 +88,27 @@ class _Scales:
     range_norm: LogNorm
     height_norm: Normalize
     half_view_m: float
-    range_colours: Colormap
-    height_colours: Colormap
+    # Yellow is near and violet far; near-white is left to the rays without a return.
+    range_colours: ClassVar[Colormap] = colormaps["viridis_r"].with_extremes(bad=NO_RETURN)
+    height_colours: ClassVar[Colormap] = colormaps["turbo"].with_extremes(bad=NO_RETURN)
 
     @classmethod
-    def of(cls, panels: list[_Panel], max_range_m: float | None) -> "_Scales":
+    def of(cls, panels: list[_Panel]) -> "_Scales":
         """Return scales that hold all but the outermost returns of all panels."""
         ranges = np.concatenate([panel.range_m[panel.return_mask] for panel in panels] + [np.array([1.0])])
         points = np.concatenate([panel.points_xyz_m for panel in panels] + [np.zeros((1, 3))])
-        far = max_range_m or float(ranges.max())
+        far = float(ranges.max())
         near = min(float(np.quantile(ranges, 0.005)), far / 2)
         away = np.hypot(points[:, 0], points[:, 1])
         low, high = np.quantile(points[:, 2], (0.01, 0.99))
         return cls(
             LogNorm(near, far),
             Normalize(float(low), float(max(high, low + 0.1))),
-            max_range_m or max(float(np.quantile(away, 0.99)), 1.0),
-            # Yellow is near and violet far; near-white is left to the rays without a return.
-            _with_bad("viridis_r", NO_RETURN),
-            _with_bad("turbo", NO_RETURN),
+            max(float(np.quantile(away, 0.99)), 1.0),
         )
 
 
-def _with_bad(name: str, colour: str) -> Colormap:
-    return colormaps[name].with_extremes(bad=colour)
-
-
-def _check(groups: dict[str, RangeImage], max_range_m: float | None) -> None:
+def _check(groups: dict[str, RangeImage]) -> None:
     if not groups:
         raise ConfigError("no group of range images", "one or more", "pass for instance {'real': images}")
     for name, images in groups.items():
@@ -130,18 +118,18 @@ def _check(groups: dict[str, RangeImage], max_range_m: float | None) -> None:
                 f"one image (H, W), or a batch (B, H, W) of 1 to {SCANS_AT_MOST}",
                 f"pass a part of them: images[:{SCANS_AT_MOST}]",
             )
-    if max_range_m is not None and not max_range_m > 0:
-        raise ConfigError(f"a largest range of {max_range_m:g} m", "more than 0 m", "leave max_range_m out")
 
 
-def _panel(images: RangeImage, index: int, title: str) -> _Panel:
+def _panel(images: RangeImage, index: int, name: str, surprise: Tensor | None, filled: Tensor | None) -> _Panel:
     image = (images[index] if images.range_m.ndim == 3 else images).to("cpu")
     return _Panel(
-        title,
+        f"scan {index + 1}: {name}",
         image.range_m.detach().numpy(),
         image.return_mask.numpy(),
         points_of_pixels(image).detach()[image.return_mask].numpy(),
         image.sensor.elevation_rad.double().mean(dim=1).rad2deg().numpy(),
+        None if surprise is None else surprise[index].detach().cpu().numpy(),
+        None if filled is None else filled[index].cpu().numpy(),
     )
 
 
@@ -227,3 +215,16 @@ def _plot_scales(figure: Figure, height: float, scales: _Scales, more: str = "")
         ScalarMappable(scales.height_norm, scales.height_colours), bar, orientation="horizontal"
     )
     colour_bar.set_label("from above: height over the sensor [m]", fontsize=10, labelpad=1)
+
+
+@torch.no_grad()
+def plot_progress(generator: Generator, stage: str, val: RangeImages, path: Path) -> None:
+    """Plot validation scans, their reconstructions, and new scans once more than a tokenizer is in training."""
+    real = val.batch(evenly_spaced(_SCANS, len(val)))
+    groups = {"val": real}
+    if "encode" in generator.capabilities:
+        groups["reconstructed"] = generator.reconstruct(real).to("cpu")
+    samples = stage != generator.stages[0] or len(generator.stages) == 1
+    if samples and Nothing in generator.takes:
+        groups["generated"] = generator.sample(range(_SCANS)).to("cpu")
+    plot_comparison(groups, path, title=f"{stage}, {path.stem} scans seen")

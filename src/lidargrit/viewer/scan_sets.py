@@ -21,6 +21,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
+_BESIDE_AT_MOST = 200_000  # points of a scan on a page that have no pixel: a map of many scans has millions
 _BATCH = 8  # scans computed at once: what a laptop has memory for
 SURPRISED_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
 _NAME_LETTERS = 40  # of a source's name: what fits above a picture
@@ -36,8 +37,9 @@ class ScanSet:
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
             if no model was asked.
         filled: True for pixels whose point a model filled in; None where no scan says so.
-        beside: points of each scan that have no pixel in its image, None for none; empty if the scans are no clouds.
-        shows_beside: whether a page shows these points, too, or only counts them.
+        beside: points of each scan without a pixel in its image that are shown besides, None for none; empty if the
+            scans are no clouds.
+        hidden: number of points of each scan that are not shown; empty if all are.
         generated: whether a model generated all of it.
     """
 
@@ -47,14 +49,8 @@ class ScanSet:
     surprise: Float[Tensor, "B H W"] | None = None
     filled: Bool[Tensor, "B H W"] | None = None
     beside: tuple[Scan | None, ...] = ()
-    shows_beside: bool = False
+    hidden: tuple[int, ...] = ()
     generated: bool = False
-
-    def hidden(self) -> list[int]:
-        """Return how many points of each scan are not shown."""
-        if self.shows_beside or not self.beside:
-            return [0] * len(self.scan_names)
-        return [0 if scan is None else len(scan) for scan in self.beside]
 
 
 def load_scan_sets(
@@ -100,8 +96,8 @@ def load_scan_sets(
         if not isinstance(source, RunSource):
             rays = _fine(named or config.imaged(source.sensor)) if fine else sensor
             how = (count, rays, config)
-            read = _of_scans(source, *how) if isinstance(source, DatasetSource) else _of_images(source, *how)
-            sets.append(replace(read, name=_short(source.text), shows_beside=fine))
+            read = _of_scans(source, *how, fine) if isinstance(source, DatasetSource) else _of_images(source, *how)
+            sets.append(replace(read, name=_short(source.text)))
     scans = sets[0] if sets else None
     for name, generator in generators.items():
         sets += _of_generator(name, generator, seeds, scans)
@@ -153,11 +149,13 @@ def _of_images(source: Source, count: int, sensor: SensorModel | None, config: D
     return ScanSet(source.text, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
 
 
-def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, config: DataConfig) -> ScanSet:
+def _of_scans(
+    source: DatasetSource, count: int, sensor: SensorModel | None, config: DataConfig, shows_beside: bool
+) -> ScanSet:
     dataset, imaging = source.scans(), source.imaging(sensor, config)
     imaging.report()
     sensor, config = imaging.sensor, imaging.config
-    images, names, filled, beside = [], [], [], []
+    images, names, filled, beside, hidden = [], [], [], [], []
     for index in evenly_spaced(count, len(dataset)):
         try:
             scan = dataset.scan(index)
@@ -173,13 +171,17 @@ def _of_scans(source: DatasetSource, count: int, sensor: SensorModel | None, con
         images.append(image)
         names.append(dataset.name(index))
         filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
-        beside.append(None if bool(has_pixel.all()) else replace(scan, rows=None).select(~has_pixel))
+        without = (~has_pixel).nonzero()[:, 0]
+        shown_too = without[evenly_spaced(_BESIDE_AT_MOST * shows_beside, len(without))]
+        beside.append(replace(scan, rows=None).select(shown_too) if len(shown_too) else None)
+        hidden.append(len(without) - len(shown_too))
     if not images:
         raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
     known = any(one is not None for one in filled)
     stacked = RangeImage.stack(images)
-    return ScanSet(source.text, stacked, tuple(names), filled=marks if known else None, beside=tuple(beside))
+    marks = marks if known else None
+    return ScanSet(source.text, stacked, tuple(names), None, marks, tuple(beside), tuple(hidden))
 
 
 def _of_pixels(marks: Bool[Tensor, "n"], point: Int32[np.ndarray, "H W"]) -> Bool[Tensor, "H W"]:

@@ -4,24 +4,18 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidargrit.scans.fit_sensor import SensorFit
-from lidargrit.viewer._matplotlib import DOTS_PER_INCH, write_png
+from lidargrit.viewer._matplotlib import write_png
 
 _POINT, _ROW, _BAD = "#3b6ea5", "#d95f02", "#b2182b"
 _BINS_PER_ROW = 12  # of the histogram of elevations: enough to see a gap between rows, few enough to see peaks
 
 
 def plot_sensor_fit(fit: SensorFit, path: Path) -> None:
-    """Plot elevations with the fitted rows, the spread and number of points of each ring, and steps in azimuth.
-
-    Args:
-        fit: fitted sensor with its residuals.
-    """
-    figure = Figure(figsize=(14.0, 9.0), dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
+    """Plot elevations with the fitted rows, the spread and number of points of each ring, and steps in azimuth."""
+    figure = Figure(figsize=(14.0, 9.0), layout="constrained")
     sensor = fit.sensor
     figure.suptitle(
         f"{sensor.name}: {sensor.height} rows ({fit.method}), {sensor.width} columns, scans: {fit.num_scans}, "

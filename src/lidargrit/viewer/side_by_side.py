@@ -28,14 +28,10 @@ def view(
     surprise_by: str = "",
     device: str = "",
 ) -> None:
-    """Plot scans, samples, and the scans that runs generate and reconstruct.
+    """Plot scans, samples, and the scans that runs generate and reconstruct; see also :func:`load_scan_sets`.
 
     Args:
-        sources: sources, as :func:`load_scan_sets` takes them.
         out: path of the PNG, or of the page if it ends in ``.html``.
-        count: number of scans of each set, evenly spaced over its source.
-        seed: seed of the first generated scan.
-        settings: sensor that scans are imaged with, and settings of reading them.
         surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
             the return mask; none if empty.
     """
@@ -62,12 +58,14 @@ def view(
 
 def _tell_hidden(scans: ScanSet, is_page: bool) -> None:
     """Say how many points of a set of clouds are not shown, and why."""
-    hidden, shown = sum(scans.hidden()), int(scans.images.return_mask.sum())
+    beside = [len(scan) for scan in scans.beside if scan]
+    hidden, shown = sum(scans.hidden), int(scans.images.return_mask.sum()) + sum(beside)
     if hidden:
-        sensor = scans.images.sensor
+        size = f"{scans.images.sensor.height}x{scans.images.sensor.width}"
         cure = "leave samples, runs, --color and data.columns out" if is_page else "write an .html"
-        size = f"{sensor.height}x{sensor.width}"
         why = f"each pixel of {size} shows one; {cure} to see all"
+        if beside:
+            why = f"a page shows {max(beside):,} points beside the pixels of {size}"
         reporting.message(f"{scans.name}: {hidden:,} of {hidden + shown:,} points are hidden, since {why}")
 
 

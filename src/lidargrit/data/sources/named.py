@@ -10,11 +10,13 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import OutputError, printable
 from lidargrit.data.datasets import ScanDataset, Window
+from lidargrit.data.formats import read_scan
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import DatasetSource
+from lidargrit.data.sources import DatasetSource, open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.source import Source
+from lidargrit.scans.many_scans import usable_scans
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
@@ -173,3 +175,27 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
 
 def _name_of(image: Path) -> str:
     return image.stem if image.suffix == ".npy" else image.name  # beside scan.npy there may lie scan.NPY
+
+
+def first_scan(text: str, config: DataConfig) -> tuple[Scan, str]:
+    """Read the first scan of a source, or the first that can be used if the others may be skipped.
+
+    Args:
+        text: file of a scan, or source of scans.
+        config: treatment of bad points and bad scans.
+
+    Returns:
+        the scan, whose notes name those that were skipped; and the sensor of the data set, "" where none is known.
+    """
+    skips = config.bad_scans == "skip"
+    if Path(text).is_file() and not skips:
+        return read_scan(text, bad_points=config.bad_points), ""
+    source = open_source(text, config.bad_points)
+    dataset = source.scans()
+    # The files of a folder that is no known data set tell no sensor, as a file alone tells none.
+    sensor = "" if source.data_set == "folder" else dataset.sensor
+    if not skips:
+        scan, skipped = dataset.scan(0), ()
+    else:
+        (scan,), skipped = usable_scans(dataset, range(len(dataset)), at_most=1)
+    return replace(scan, notes=(*dataset.notes, *skipped, *scan.notes)), sensor

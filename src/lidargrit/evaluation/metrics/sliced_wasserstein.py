@@ -260,7 +260,6 @@ def standardised(patches: Float[Tensor, "n 49"], correction: int) -> Float[Tenso
     """Scale all numbers of a set together to mean 0 and deviation 1.
 
     Args:
-        patches: patches of one set at one level.
         correction: 1 for the unbiased deviation, 0 for that of the set itself.
     """
     deviation, mean = torch.std_mean(patches, correction=correction)

@@ -15,7 +15,6 @@ class MetricChoice:
     """One number that a protocol asks for.
 
     Args:
-        metric: name of the metric.
         variant: published definition of the metric; its first one if empty.
     """
 
@@ -28,9 +27,7 @@ class Protocol:
     """Everything that must be equal before two scores of one name may be compared.
 
     Args:
-        title: description of one line.
         source: paper or program (with its commit) that the protocol follows.
-        metrics: metrics that are computed, in the order of the table.
         sensor: name of the sensor whose rays the images have; that of the samples or of the scans if empty.
         columns: number of columns of the full circle; the sensor's own if 0.
         column_stride: step between the columns that are kept.

@@ -22,7 +22,7 @@ from lidargrit.data.scan_folder import IMAGE, TREE, KittiTree, ScanFolder, check
 from lidargrit.data.sources.image_files import PROBABILITY
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.clouds_to_files import suffix_of, write_cloud
-from lidargrit.inference.complete.inputs import Inputs, InputScan
+from lidargrit.inference.complete.inputs import Inputs, InputScan, open_inputs
 from lidargrit.inference.complete.tasks import Task, complete_images
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
@@ -223,3 +223,31 @@ def _probability_file(file: str) -> str:
 
 def _folder(turn: int, count: int) -> str:
     return f"completion_{turn}/" if count > 1 else ""
+
+
+def complete_scans(
+    source: str,
+    out: Path,
+    model: Model,
+    task: Task,
+    output: OutputConfig,
+    config: DataConfig | None = None,
+) -> Written:
+    """Write the scans of a source as a task changes them: whole clouds, or the images of the model.
+
+    Args:
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
+        out: an empty folder, or one that the same command began.
+        model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
+        task: the work on each scan.
+        output: number and kind of files.
+        config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
+
+    Returns:
+        what was written, and how many points came in and went out.
+    """
+    config = config or DataConfig()
+    reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)
+    inputs = open_inputs(source, reader, config)
+    facts = {"verb": task.verb, "source": source, **task.identity()}
+    return write_completions(inputs, out, model, task, output, facts, config)

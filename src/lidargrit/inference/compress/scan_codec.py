@@ -17,10 +17,8 @@ from lidargrit.generation.pixel_decoder.pixel_networks import Guide
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.generation.tokens import TokenGenerator
-from lidargrit.inference.compress.arithmetic import sigmoid
-from lidargrit.inference.compress.coder import ONE, Coder, Decoder, Encoder, not_reproduced
-from lidargrit.inference.compress.rounding import MASK_LOGITS, Rounding
-from lidargrit.inference.compress.step_mixture import StepMixture
+from lidargrit.inference.compress.coder import ONE, Coder, Decoder, Encoder, StepMixture, not_reproduced
+from lidargrit.inference.compress.rounding import MASK_LOGITS, Rounding, sigmoid
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 from lidargrit.systems.multiscale.system import Multiscale
 

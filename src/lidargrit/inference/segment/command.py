@@ -2,8 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, get_args
 
-from jaxtyping import Int
+import numpy as np
+import torch
+from jaxtyping import Float64, Int, Int64
 from torch import Tensor
 
 from lidargrit.core import reporting
@@ -15,12 +18,109 @@ from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
 from lidargrit.inference.complete.inputs import ScanReader
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
-from lidargrit.inference.segment.points import labels_of_points
-from lidargrit.inference.segment.scores import LabelScores
-from lidargrit.scans.classes import CLASS_BITS, as_semantic_kitti
+from lidargrit.scans.classes import CLASS_BITS, CLASSES, Group, as_semantic_kitti
+from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates
 from lidargrit.scans.sensors import ProjectionOption
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
+
+_WINDOWS = ((1, 2), (3, 8))  # rows and columns around a point's pixel: the second where the first has no return
+
+
+def labels_of_points(
+    image: RangeImage, point_of_pixel: Int64[Tensor, "H W"], at: PixelCoordinates
+) -> Int[Tensor, " n"]:
+    """Return a label for every point.
+
+    A point that fills a pixel has its label. Any other lies behind a nearer point of its pixel, beyond the sensor's
+    limits, or above or below all rows: of the returns around its pixel (three rows and five columns; seven and 17
+    where there is none) that one gives the label whose range is nearest to the point's. Where none returned, the
+    label is 0.
+
+    Args:
+        image: labelled range image (H, W) of the scan.
+        point_of_pixel: index of the point that fills each pixel, -1 for none.
+        at: row, column and range of every point.
+
+    Source:
+        Milioto et al., RangeNet++, IROS 2019, section III-D, with one neighbour in place of five.
+    """
+    assert image.label is not None
+    label_of_pixel, range_m = image.label.numpy(), image.range_m.numpy()
+    label = np.zeros(len(at.range_m), np.int64)
+    filled = point_of_pixel.numpy()
+    label[filled[filled >= 0]] = label_of_pixel[filled >= 0]
+    without = np.ones(len(label), bool)
+    without[filled[filled >= 0]] = False
+    height, width = range_m.shape
+    for rows, columns in _WINDOWS:
+        left = np.flatnonzero(without)
+        down, right = (each.ravel() for each in np.mgrid[-rows : rows + 1, -columns : columns + 1])
+        row = np.clip(at.row[left].astype(np.int64), 0, height - 1)[:, None] + down
+        column = (at.column[left].astype(np.int64)[:, None] + right) % width
+        inside = (row >= 0) & (row < height)
+        row = np.clip(row, 0, height - 1)
+        apart_m = np.abs(range_m[row, column] - at.range_m[left][:, None])
+        apart_m[~inside | (range_m[row, column] == 0)] = np.inf
+        nearest = apart_m.argmin(1)
+        found = np.isfinite(apart_m[np.arange(len(left)), nearest])
+        pixel = row[np.arange(len(left)), nearest], column[np.arange(len(left)), nearest]
+        label[left[found]] = label_of_pixel[pixel][found]
+        without[left[found]] = False
+    return torch.from_numpy(label)
+
+
+GROUPS = tuple(group for group in get_args(Group) if group)
+_GROUP_OF = torch.zeros(max(CLASSES) + 1, dtype=torch.int64)
+for _number, _class in CLASSES.items():
+    _GROUP_OF[_number] = GROUPS.index(_class.group) + 1 if _class.group else 0
+
+
+class LabelScores:
+    """Counts of points by true and found group of classes, over scans.
+
+    Points whose true class is in no group do not count. A found class of no group is wrong.
+
+    Source:
+        the mean intersection over union of Behley et al., SemanticKITTI, ICCV 2019, over coarser classes.
+    """
+
+    def __init__(self) -> None:
+        size = len(GROUPS) + 1
+        self.counts = torch.zeros(size, size, dtype=torch.int64)
+        """Number of points by true group (rows) and found group (columns); the first of each is no group."""
+
+    def add(self, found: Int[Tensor, " n"], true: Int[Tensor, " n"]) -> None:
+        """Count the points of a scan, of labels by SemanticKITTI's numbers."""
+        pairs = _GROUP_OF[true.long()] * len(self.counts) + _GROUP_OF[found.long()]
+        self.counts += pairs.bincount(minlength=self.counts.numel()).view_as(self.counts)
+
+    def intersection_over_union(self) -> dict[str, float]:
+        """Return the score of each group of which there are true points, in [0, 1]."""
+        counts: Float64[Tensor, "g g"] = self.counts[1:].double()
+        right, true, found = counts[:, 1:].diagonal(), counts.sum(1), counts[:, 1:].sum(0)
+        scores = right / (true + found - right).clamp(min=1)
+        return {group: float(scores[at]) for at, group in enumerate(GROUPS) if true[at] > 0}
+
+    def mean(self) -> float:
+        """Return the mean over the groups of which there are true points; NaN without any."""
+        each = self.intersection_over_union().values()
+        return sum(each) / len(each) if each else float("nan")
+
+    def as_table(self) -> str:
+        """Return the scores as lines for a person."""
+        rows = [*self.intersection_over_union().items(), ("mean", self.mean())]
+        return "\n".join(f"{name:<16}{value:>6.3f}" for name, value in rows)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the scores and the counts as plain values."""
+        return {
+            "intersection_over_union": self.intersection_over_union(),
+            "mean": self.mean(),
+            "groups": ["", *GROUPS],
+            "points_by_true_and_found_group": self.counts.tolist(),
+        }
+
 
 MANIFEST = "segmented.json"
 _FEW_RINGS_CURE = (

@@ -1,7 +1,7 @@
 """Scans of an unknown sensor → its :class:`SensorModel`, with the evidence for and against the fit."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,20 +9,69 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
+from lidargrit.core import discovery
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.fit_sensor.azimuths import columns_of_scans, firing_steps_deg, first_edge_rad, offsets_deg
 from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
-from lidargrit.scans.fit_sensor.known import notes_on_sensor
-from lidargrit.scans.fit_sensor.limits import farthest_m, quantum_m
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
 from lidargrit.scans.many_scans import ManyScans, usable_scans
 from lidargrit.scans.projection.frame import told_height
+from lidargrit.scans.projection.pixel_coordinates import row_elevation_rad
 from lidargrit.scans.projection.revolutions import told_revolutions
 from lidargrit.scans.projection.sensor_check import closest_sensor
 from lidargrit.scans.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad, load_sensor
 from lidargrit.scans.types import Scan
+
+_SAME_AT_MOST = 0.25  # of the usual step between rows, in the mean: half of it would be the neighbours'
+
+
+def notes_on_sensor(rows: FittedRows, rings: Rings) -> Iterator[str]:
+    """Yield what is known of a sensor from elsewhere: its name, and in which direction such sensors turn.
+
+    The lidars of Velodyne, Hesai and Ouster turn clockwise, seen from above. Files that keep one firing after another
+    show it; those that are sorted ring by ring may be sorted either way.
+    """
+    fitted_deg = rows.elevation_deg
+    step_deg = float(np.median(np.abs(np.diff(fitted_deg))))
+    off_deg = {
+        name: float(np.abs(fitted_deg - np.degrees(row_elevation_rad(sensor))).mean())
+        for name in discovery.names("sensors")
+        if (sensor := load_sensor(name)).height == len(fitted_deg)
+    }
+    nearest = min(off_deg, key=lambda name: off_deg[name], default="")
+    if nearest and off_deg[nearest] < _SAME_AT_MOST * step_deg:
+        how = f"its rows lie {off_deg[nearest]:.2f} degrees from these in the mean"
+        yield f"the package has this sensor: {nearest} ({how}); --sensor {nearest} needs no file"
+    if rings.lasers and rings.counter_clockwise:
+        yield (
+            "it turns counter-clockwise, seen from above, where lidars turn clockwise: the files may be mirrored (y to "
+            "the right, as CARLA has it), or the sensor hangs upside down"
+        )
+
+
+_STEPS_M = (0.02, 0.012, 0.01, 0.008, 0.005, 0.004, 0.003, 0.002, 0.001)  # in which sensors and files count
+_NEAR_A_STEP = 0.1  # of a step to either side; numbers that know no step are there at every fifth
+_SHARE_AT_LEAST = 0.8
+
+
+def farthest_m(range_m: Float64[np.ndarray, "n"]) -> float:
+    """Return a limit that holds all points but one in ten thousand, rounded up to whole metres.
+
+    Scans tell no near limit: other scans of the same sensor may have returns nearer than the nearest of these.
+    """
+    return float(math.ceil(float(np.quantile(range_m, 0.9999))))
+
+
+def quantum_m(values_m: Float64[np.ndarray, "n"]) -> float | None:
+    """Return the largest step, in metres, of which nearly all values are whole multiples; None if there is none."""
+    for step_m in _STEPS_M:
+        off = np.abs(values_m / step_m - np.round(values_m / step_m))
+        if float((off < _NEAR_A_STEP).mean()) > _SHARE_AT_LEAST:
+            return step_m
+    return None
+
 
 __all__ = ["SensorFit", "fit_sensor", "fit_sensor_to_dataset"]
 

@@ -1,11 +1,10 @@
 """Between scans and range images: project, unproject, and the encodings of range that networks see."""
 
 from lidargrit.scans.projection.encoding import RangeEncoding
-from lidargrit.scans.projection.image import index_map, project, project_by_what_fits
+from lidargrit.scans.projection.image import index_map, points_of_pixels, project, project_by_what_fits, unproject
 from lidargrit.scans.projection.inspection import Inspection, inspect
 from lidargrit.scans.projection.pixel_coordinates import ProjectionVariant
 from lidargrit.scans.projection.sensor_check import FIT_SENSOR, closest_sensor, doubts_about_rays, projection_that_fits
-from lidargrit.scans.projection.unproject import points_of_pixels, unproject
 
 __all__ = [
     "FIT_SENSOR",

@@ -12,11 +12,16 @@ from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json
 from lidargrit.core.untrusted import user_path
-from lidargrit.scans.sensors._checks import FINE_COLUMNS_AT_MOST, check_projection, check_tables, checked_entries
+from lidargrit.scans.sensors._checks import (
+    FINE_COLUMNS_AT_MOST,
+    check_projection,
+    check_tables,
+    checked_entries,
+    column_azimuths_rad,
+)
 from lidargrit.scans.sensors._checks import NAME_AT_MOST as NAME_AT_MOST
-from lidargrit.scans.sensors._columns import column_azimuths_rad
-from lidargrit.scans.sensors._columns import continuous_azimuths_rad as continuous_azimuths_rad
-from lidargrit.scans.sensors._columns import mean_azimuths_rad as mean_azimuths_rad
+from lidargrit.scans.sensors._checks import continuous_azimuths_rad as continuous_azimuths_rad
+from lidargrit.scans.sensors._checks import mean_azimuths_rad as mean_azimuths_rad
 
 _REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
 

@@ -3,18 +3,169 @@
 from dataclasses import dataclass, field
 
 import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
+from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
-from lidargrit.generation.objective import Objective
+from lidargrit.generation.objective import Objective, hidden_in_some
+from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, required_reflectance
+from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, labels_of, labels_to_learn
 from lidargrit.nn.flops import FlopCounter
+from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Condition
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage
-from lidargrit.systems.segmenter.network import SegmenterNetwork, SegmenterNetworkConfig
-from lidargrit.systems.segmenter.objective import SegmenterObjective
+from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
+
+_NUM_MAPS = 4
+_HEIGHT_M = 3.0  # the scale of heights: what stands on the ground is about so high
+_HEIGHTS_AT_MOST = 4.0  # times that
+
+
+@dataclass(frozen=True)
+class SegmenterNetworkConfig(Settings):
+    """Sizes of the segmenter's network, and what it sees.
+
+    Args:
+        widths: channels at a half, a quarter and an eighth of the image's rows and columns.
+        blocks: residual blocks at an eighth.
+        attention_layers: layers of attention between all pixels at an eighth, among the residual blocks.
+        heads: attention heads of each layer.
+        reflectance: whether the network sees the reflectance of returns, where scans have it.
+    """
+
+    widths: tuple[Count, Count, Count] = (32, 64, 96)
+    blocks: Count = 2
+    attention_layers: NotNegative = 1
+    heads: Count = 4
+    reflectance: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.attention_layers > self.blocks:
+            got = f"attention_layers={self.attention_layers}, blocks={self.blocks}"
+            raise ConfigError(got, "at most a layer of attention a block", "change one")
+
+
+class SegmenterNetwork(nn.Module):
+    """A small U-Net over the returns of a scan: range, height above the sensor, and elevation of every pixel.
+
+    Args:
+        config: sizes of the network.
+        sensor: the rays and limits of the range images.
+
+    Source:
+        the inputs of Milioto et al., RangeNet++, IROS 2019, without x and y, which tell where the scan turns.
+    """
+
+    def __init__(self, config: SegmenterNetworkConfig, sensor: SensorModel) -> None:
+        super().__init__()
+        check_size(sensor.height, sensor.width, "a segmenter")
+        self.config = config
+        self.register_buffer("elevation_rad", sensor.elevation_rad.double().mean(1).float(), persistent=False)
+        sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
+        parts = {"reflectance": Part(2, 0)} if config.reflectance else {}
+        self.unet = SmallUnet(sizes, _NUM_MAPS, NUM_CLASSES, parts)
+
+    elevation_rad: Tensor
+
+    def forward(
+        self, range_m: Float[Tensor, "B H W"], reflectance: Float[Tensor, "B H W"] | None = None
+    ) -> Float[Tensor, "B 19 H W"]:
+        """Return a logit for each of the benchmark's classes at every pixel.
+
+        Args:
+            range_m: ranges in metres, 0 where nothing returned.
+            reflectance: reflectance of the returns, NaN where it is not known; None if it is known of none.
+        """
+        more = dict[str, Tensor]()
+        if self.config.reflectance:
+            known = torch.zeros_like(range_m) if reflectance is None else reflectance.isfinite().to(range_m.dtype)
+            value = torch.zeros_like(range_m) if reflectance is None else reflectance - TYPICAL_REFLECTANCE
+            more["reflectance"] = torch.stack((known, torch.where(known > 0, value, 0.0)), 1)
+        logits, _ = self.unet(self._maps(range_m), more)
+        return logits.float()
+
+    def classes(self, images: RangeImage) -> Int[Tensor, "B H W"]:
+        """Return the likeliest class of each return, by SemanticKITTI's numbers; 0 where nothing returned."""
+        label = labels_of(self(images.range_m, images.reflectance).argmax(1) + 1)
+        return torch.where(images.return_mask, label, 0)
+
+    def _maps(self, range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B 4 H W"]:
+        """Return maps of returns, their ranges and heights, and the elevations of the rays."""
+        returned = range_m > 0
+        elevation = self.elevation_rad[:, None].expand_as(range_m)
+        height = (range_m * elevation.sin() / _HEIGHT_M).clamp(-_HEIGHTS_AT_MOST, _HEIGHTS_AT_MOST)
+        near = torch.where(returned, range_m.log1p() - TYPICAL_LOG_RANGE, 0.0)
+        return torch.stack((returned.to(range_m.dtype), near, height, 5 * elevation), 1)
+
+
+_SETTING = "model.segmenter.reflectance"
+_WITHOUT_REFLECTANCE = 0.5  # of the scans: generated ones often have none
+_NOISE_M = 0.05  # largest standard deviation of noise added in training, so that clean ranges are known, too
+
+
+class SegmenterObjective(Objective):
+    """The cross-entropy of the classes of returns; a class counts by the square root of its share of them.
+
+    Args:
+        network: network that is trained.
+        sensor: sensor whose scans it labels.
+    """
+
+    additions = frozenset({"reflectance"})
+
+    def __init__(self, network: SegmenterNetwork, sensor: SensorModel) -> None:
+        super().__init__(sensor)
+        self.segmenter = network
+
+    def check(self, images: RangeImage) -> None:
+        """Refuse images without labels, or without the reflectance that the network is to see."""
+        labels_to_learn(images.label)
+        if self.segmenter.config.reflectance:
+            required_reflectance(images.reflectance, _SETTING)
+
+    def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
+        """Return the loss, and beside it the share of returns whose class it finds, and the mean over classes of the
+        intersection over the union.
+        """
+        images = example.images
+        range_m, reflectance = images.range_m, None
+        if self.segmenter.config.reflectance:
+            reflectance = required_reflectance(images.reflectance, _SETTING)
+            reflectance = hidden_in_some(reflectance, torch.nan, _WITHOUT_REFLECTANCE, rng)
+        if self.training:
+            noise = torch.randn(range_m.shape, generator=rng, device=rng.device)
+            most = torch.rand((len(range_m), 1, 1), generator=rng, device=rng.device) * _NOISE_M
+            noisy = (range_m + noise * most).clamp(min=self.sensor.range_min_m)
+            range_m = torch.where(images.return_mask, noisy, 0.0)
+        wanted = torch.where(images.return_mask, class_indices(labels_to_learn(images.label)), 0)
+        logits = self.segmenter(range_m, reflectance)
+        counts = pair_counts(logits.detach(), wanted)
+        of_class = counts.sum(0)
+        weight = torch.where(of_class > 0, of_class.clamp(min=1).rsqrt(), 0.0)
+        loss = F.cross_entropy(logits, wanted - 1, weight, ignore_index=-1)  # 0, no class, becomes -1
+        right = counts.diagonal()
+        iou = right / (counts.sum(1) + of_class - right).clamp(min=1)
+        mean_iou = iou.where(of_class > 0, 0).sum() / (of_class > 0).sum().clamp(min=1)
+        return {"loss": loss, "accuracy": right.sum() / of_class.sum().clamp(min=1), "mean_iou": mean_iou}
+
+
+def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"]) -> Float[Tensor, "19 19"]:
+    """Count the pixels of each found class (rows) and true class (columns), of those whose true class is known.
+
+    Args:
+        wanted: true class, from 1 to 19; 0 where it is not known.
+    """
+    pairs = (logits.argmax(1) * (NUM_CLASSES + 1) + wanted).flatten()
+    counts = logits.new_zeros(NUM_CLASSES * (NUM_CLASSES + 1)).scatter_add(0, pairs, logits.new_ones(len(pairs)))
+    return counts.view(NUM_CLASSES, NUM_CLASSES + 1)[:, 1:]
 
 
 @dataclass(frozen=True)

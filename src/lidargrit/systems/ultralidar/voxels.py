@@ -11,7 +11,7 @@ from torch import Tensor
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count, Positive
-from lidargrit.scans.projection.unproject import points_of_pixels
+from lidargrit.scans.projection.image import points_of_pixels
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 

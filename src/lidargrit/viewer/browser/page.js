@@ -3,6 +3,11 @@
 const TURN_A_FRAME = 0.004; // a turn in half a minute
 const DENSE = 50000; // pixels of a scan whose points would cover one another if they were as large as those of others
 
+let touched = false; // whether somebody has taken hold of anything on the page
+for (const kind of ["pointerdown", "keydown", "wheel"]) {
+  window.addEventListener(kind, () => (touched = true), { once: true, capture: true });
+}
+
 class Page {
   constructor(data) {
     this.data = data;
@@ -102,12 +107,9 @@ class Page {
 
   // Turn by itself, until somebody takes hold of anything.
   turn() {
-    let turning = !window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-    for (const kind of ["pointerdown", "keydown", "wheel"]) {
-      window.addEventListener(kind, () => (turning = false), { once: true, capture: true });
-    }
+    const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
     const next = () => {
-      if (turning && this.panes.length > 0) {
+      if (!still && !touched && this.panes.length > 0) {
         this.camera.orbit(TURN_A_FRAME, 0);
         this.redraw();
         requestAnimationFrame(next);

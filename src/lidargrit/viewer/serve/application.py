@@ -21,14 +21,18 @@ import numpy as np
 import torch
 
 from lidargrit.core.errors import ConfigError, LidarGritError, OutputError, one_of
+from lidargrit.core.untrusted import SEED_AT_MOST
+from lidargrit.core.version import __version__
 from lidargrit.data import formats
 from lidargrit.scans.planes import PLANES
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
+from lidargrit.viewer import interactive
+from lidargrit.viewer._page import asset, part
 from lidargrit.viewer.serve.jobs import Job, JobQueue
-from lidargrit.viewer.serve.page import page, script, style
 from lidargrit.viewer.serve.requests import (
+    EXAMPLES,
     TASKS,
     SampleRequest,
     parse_json_object,
@@ -63,9 +67,6 @@ class Response(NamedTuple):
     """The response to a request.
 
     Args:
-        status: HTTP status, such as "200 OK".
-        body: all bytes of the content.
-        media_type: media type of the content.
         file_name: name under which a browser saves the content; "" to show it.
     """
 
@@ -87,7 +88,6 @@ class Application:
     """The WSGI application of the server.
 
     Args:
-        queue: queue with the jobs of all clients.
         host: address at which it is served; the loopback's names are known besides.
     """
 
@@ -256,3 +256,26 @@ def _is_number(name: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def page() -> str:
+    """Return the page without models and scans, which its script requests from the server."""
+    buttons = {kind: f".{kind}" for kind in _WRITERS} | {"remove": "Remove"}
+    return part(
+        "serve.html",
+        viewer=interactive.viewer_html(buttons, f"lidargrit {__version__}.", label="Save"),
+        tasks=TASKS,
+        examples=EXAMPLES,
+        seed_at_most=SEED_AT_MOST,
+        endings=upload_endings(),
+    )
+
+
+def script() -> str:
+    """Return the scripts of the page."""
+    return interactive.scripts() + asset("serve.js")
+
+
+def style() -> str:
+    """Return the style sheet of the page."""
+    return interactive.style() + asset("serve.css")

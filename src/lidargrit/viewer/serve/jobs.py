@@ -20,8 +20,7 @@ from typing import Any, Literal
 from lidargrit.core import errors
 from lidargrit.core.errors import DataError, LidarGritError
 from lidargrit.core.processes import module_command
-from lidargrit.viewer.serve.limits import Limits
-from lidargrit.viewer.serve.requests import SampleRequest, SamplingSetting
+from lidargrit.viewer.serve.requests import Limits, SampleRequest, SamplingSetting
 
 State = Literal["waiting", "running", "done", "failed"]
 
@@ -45,9 +44,7 @@ class JobQueue:
     """Runs jobs in the order in which they were submitted.
 
     Args:
-        runs: folders of finished runs.
         folder: an empty folder for uploads and results; the caller removes it.
-        limits: bounds on what may be asked for.
     """
 
     def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits | None = None) -> None:

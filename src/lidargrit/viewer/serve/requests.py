@@ -13,7 +13,6 @@ from lidargrit.core.errors import CheckpointError, ConfigError, nearest_names
 from lidargrit.core.typed_values import Bounds, Share, check, fits
 from lidargrit.core.untrusted import SEED_AT_MOST, parse_json
 from lidargrit.data import formats
-from lidargrit.viewer.serve.limits import Limits
 
 UPSAMPLED = {"vlp16": "a VLP-16", "hdl32e": "an HDL-32E", "vlp32c": "a VLP-32C"}  # sensors with few rows
 TASKS = {  # what a model makes of a scan → the words of its button on the page
@@ -24,6 +23,45 @@ TASKS = {  # what a model makes of a scan → the words of its button on the pag
     **{sensor: f"Add the rows that {name} lacks" for sensor, name in UPSAMPLED.items()},
     "raydrop": "Drop rays of a clean scan",
 }
+_SECONDS_AT_MOST = 86_400
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds on size, time and number.
+
+    Args:
+        upload_bytes: largest uploaded file; a revolution of 128 rows by 2048 columns takes 12.6 MB as Ouster's PCD.
+        request_bytes: longest JSON of a request.
+        scans: largest number of scans in one request.
+        seconds: longest time that one job may compute; the worker process is ended when it is over.
+        start_seconds: longest time that the worker process may take to read the runs.
+        waiting: largest number of jobs in the queue; a further client is asked to try again.
+        unpolled_seconds: time after which a waiting job is dropped if its client no longer asks for it. Browsers let a
+            hidden tab ask once a minute.
+        kept: number of finished results that are kept; the oldest is removed first.
+        connections: largest number of open connections, each of which holds at most one upload in memory.
+        idle_seconds: time after which a connection is closed if no byte arrives on it.
+    """
+
+    upload_bytes: int = 16 << 20
+    request_bytes: int = 4096
+    scans: int = 8
+    seconds: float = 120.0
+    start_seconds: float = 300.0
+    waiting: int = 8
+    unpolled_seconds: float = 150.0
+    kept: int = 24
+    connections: int = 64
+    idle_seconds: int = 15
+
+    def __post_init__(self) -> None:
+        if not 0 < self.seconds <= _SECONDS_AT_MOST:
+            raise ConfigError(
+                f"{self.seconds:g} seconds for one job",
+                f"more than 0, at most {_SECONDS_AT_MOST:,}",
+                "choose another number",
+            )
 
 
 class Example(NamedTuple):
@@ -31,7 +69,6 @@ class Example(NamedTuple):
 
     Args:
         words: text of its button on the page.
-        task: the task that its button asks for.
         sensor: name of the sensor that sees it; "" for that of the model.
         every_beam_returns: whether no beam is lost.
     """
@@ -57,9 +94,7 @@ class SamplingSetting:
 
     Args:
         name: name of the field in the generator's ``Sampling``.
-        whole: whether it is a whole number.
         default: default value; None where the generator computes one itself.
-        at_most: largest value that is accepted.
         about: description, from the docstring of ``Sampling``.
     """
 
@@ -77,7 +112,6 @@ class SampleRequest:
     Args:
         model: index of the model among those that are served.
         seed: seed of the first scan; the next scan has the next seed.
-        count: number of scans.
         sampling: values of the sampling settings that the client changed, by name.
         task: name of the work on the scan, a key of :data:`TASKS`.
         region: left, top, right and bottom edge of the region that is to be filled in, as shares of the image's width
@@ -131,9 +165,7 @@ def parse_request(values: dict[str, Any], settings: list[list[SamplingSetting]],
     """Check every value of a request.
 
     Args:
-        values: values by name; a missing one has its default.
         settings: sampling settings of each model that is served.
-        limits: bounds on what may be asked for.
     """
     known = ("model", "seed", "count", "sampling", "task", "region", "example", "name")
     for name in values:

@@ -19,7 +19,7 @@ from lidargrit.data.run_folder import PACKAGED, is_bundle, is_run
 from lidargrit.generation.generator import load
 from lidargrit.viewer.serve.application import ALL_ADDRESSES, LOOPBACK_NAMES, Application
 from lidargrit.viewer.serve.jobs import JobQueue
-from lidargrit.viewer.serve.limits import Limits
+from lidargrit.viewer.serve.requests import Limits
 
 _THREADS = 4  # threads that answer requests: each takes milliseconds, because the worker process computes
 _PORT_AT_MOST = 65_535
@@ -30,8 +30,6 @@ class RunningServer(NamedTuple):
     """A server that listens.
 
     Args:
-        port: port at which it listens.
-        queue: queue with the jobs of all clients.
         run: function that answers requests until Ctrl-C.
         stop: function that ends ``run`` from another thread, and with it all connections.
     """

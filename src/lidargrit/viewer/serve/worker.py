@@ -10,10 +10,9 @@ import math
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import torch
@@ -51,28 +50,28 @@ NO_ROOM = OutputError(
 
 def run_worker(runs: Sequence[Path], device: str) -> None:
     """Describe the models of the runs, then answer requests from standard input until it ends."""
-    write_line = partial(print, file=sys.stdout, flush=True)
+    answers = sys.stdout
     sys.stdout = sys.stderr  # whatever a library prints is no answer
     try:
         chosen = usable_device(device)
         loaded = [_load(run, chosen) for run in runs]
     except LidarGritError as error:
-        _send(write_line, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
+        _send(answers, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
     except RuntimeError as error:  # most of all where a GPU has no room for them
         got = f"models that cannot be loaded on the device ({_first_line(error)})"
         cure = "name fewer models, or another --device"
-        _send(write_line, {"refused": ["ConfigError", got, "a device with room for all of them", cure]})
+        _send(answers, {"refused": ["ConfigError", got, "a device with room for all of them", cure]})
         return
     names = [run.resolve().name for run in runs]
     names = [name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)]
     models = [describe_model(name, model) for name, (model, _) in zip(names, loaded, strict=True)]
-    _send(write_line, {"models": models})
+    _send(answers, {"models": models})
     for line in sys.stdin:
         message = json.loads(line)
         request = SampleRequest(**message["request"])
         generator, variant = loaded[request.model]
-        _send(write_line, _answer_request(generator, variant, request, Path(message["folder"])))
+        _send(answers, _answer_request(generator, variant, request, Path(message["folder"])))
 
 
 def _load(run: Path, device: torch.device) -> tuple[Generator, ProjectionVariant]:
@@ -125,12 +124,7 @@ def _settings_of(generator: Generator) -> list[dict[str, Any]]:
 
 
 def compute_result(generator: Generator, request: SampleRequest, variant: ProjectionVariant = "exact") -> list[ScanSet]:
-    """Sample new scans, or complete, upsample, drop or reconstruct a scan that is uploaded or an example.
-
-    Args:
-        request: task and settings that the page sent.
-        variant: variant of the projection that the model learned from.
-    """
+    """Sample new scans, or complete, upsample, drop or reconstruct a scan that is uploaded or an example."""
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
     own = generator.completion_sampling() if request.has_scan else generator.Sampling()
     sampling = dataclasses.replace(own, **request.sampling) if request.sampling else None
@@ -261,5 +255,5 @@ def _first_line(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).partition(os.linesep)[0][:100]}"
 
 
-def _send(write_line: Callable[[str], None], message: dict[str, Any]) -> None:
-    write_line(json.dumps(message))
+def _send(answers: TextIO, message: dict[str, Any]) -> None:
+    print(json.dumps(message), file=answers, flush=True)

@@ -64,7 +64,6 @@ def sampled_clouds(points: Float32[np.ndarray, "n pixels 3"], variant: str) -> C
 
     Args:
         points: points of all pixels, in units of the longest range.
-        variant: ``exact`` or ``reference``.
     """
     squared = np.square(points[..., 0]) + np.square(points[..., 1]) + np.square(points[..., 2])
     if variant == "reference":

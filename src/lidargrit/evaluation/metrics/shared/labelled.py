@@ -59,12 +59,7 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
     accumulator = SumAccumulator
 
     def __init__(
-        self,
-        *,
-        variant: str | None = None,
-        seed: int = 0,
-        weights: Path | None = None,
-        device: str = "cpu",
+        self, *, variant: str | None = None, seed: int = 0, weights: Path | None = None, device: str = "cpu"
     ) -> None:
         super().__init__(variant=variant, seed=seed)
         self.weights, self.device = weights, str(usable_device(device))

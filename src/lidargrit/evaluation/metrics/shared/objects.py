@@ -9,17 +9,7 @@ from jaxtyping import Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from lidargrit.scans.classes import (
-    BICYCLIST,
-    CAR,
-    CLASSES,
-    MOTORCYCLIST,
-    OTHER_VEHICLE,
-    PERSON,
-    POLE,
-    TRUCK,
-    TRUNK,
-)
+from lidargrit.scans.classes import BICYCLIST, CAR, CLASSES, MOTORCYCLIST, OTHER_VEHICLE, PERSON, POLE, TRUCK, TRUNK
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 

@@ -127,12 +127,7 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
     """
 
     def __init__(
-        self,
-        *,
-        variant: str | None = None,
-        seed: int = 0,
-        weights: Path | None = None,
-        device: str = "cpu",
+        self, *, variant: str | None = None, seed: int = 0, weights: Path | None = None, device: str = "cpu"
     ) -> None:
         super().__init__(variant=variant, seed=seed)
         self.network = load_network(self.needs_weights, weights, device)

@@ -105,14 +105,8 @@ class Desk {
 
   // The page begins with a scan that turns, until somebody takes hold of it.
   async begin() {
-    let touched = false;
-    for (const kind of ["pointerdown", "keydown", "wheel"]) {
-      window.addEventListener(kind, () => (touched = true), { once: true, capture: true });
-    }
     await this.submit(null, () => this.generate(1));
-    if (!touched) {
-      this.page?.turn();
-    }
+    this.page?.turn();
   }
 
   chooseExample(name) {
@@ -224,8 +218,8 @@ class Desk {
     event?.preventDefault();
     this.busy = true;
     this.enable();
-    const touched = Object.entries(this.request().sampling).map(([name, value]) => `${name}=${value}`);
-    const by = [this.model.name, ...touched].join(", ");
+    const changed = Object.entries(this.request().sampling).map(([name, value]) => `${name}=${value}`);
+    const by = [this.model.name, ...changed].join(", ");
     await this.trying(async () => {
       const { job } = await (await begin()).json();
       const seconds = await this.waited(job);
