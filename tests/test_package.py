@@ -44,3 +44,19 @@ def test_the_container_gets_what_its_preset_names():
     assert float(version[1].replace("3.", "")) >= 11
     assert re.search(r"^USER (?!root)", DOCKERFILE, re.MULTILINE)
     assert DOCKERFILE.rstrip().endswith('ENTRYPOINT ["lidargrit"]')
+
+
+def test_without_any_extra_all_formats_and_data_sets_are_known():
+    """In a process of its own, in which the packages of the extras cannot be imported."""
+    extras = ("constriction", "h5py", "huggingface_hub", "laspy", "mcap", "ouster", "pyarrow", "rosbags", "wandb")
+    script = f"""
+import sys
+sys.modules.update(dict.fromkeys({extras}))
+from lidargrit.core import discovery
+from lidargrit.data import datasets, formats
+for load, kind in ((formats.load, "formats"), (datasets.load, "datasets")):
+    print(len([load(name) for name in discovery.names(kind)]))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert all(int(count) > 5 for count in done.stdout.split())

@@ -56,8 +56,8 @@ def test_a_metric_that_would_not_have_seen_damaged_objects_is_not_within_noise()
         "Against real scans: worse in 0 of 2 scores, within noise in 1 (bev_jsd), undecided in 1 (coverage)."
     )
     assert note == (
-        "With 200 scans, coverage cannot see at least one of these: blurred ranges, missing vehicles, boxes in place of "
-        "vehicles. So a good score there is not called within noise."
+        "With 200 scans, coverage cannot see at least one of these: blurred ranges, missing vehicles, boxes in place "
+        "of vehicles. So a good score there is not called within noise."
     )
     convicted = said(score(0.85, 0.1, 0.9, metric="coverage"))
     assert convicted[1].startswith("Against real scans: worse in 1 of 1 scores")

@@ -10,9 +10,12 @@ import resource
 import signal
 import sys
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
-import h5py
 import numpy as np
+
+if TYPE_CHECKING or __name__ == "__main__":  # whoever imports this program wants its numbers, and may have no h5py
+    import h5py
 
 BYTES_AT_MOST = 256_000_000  # of an array
 SECONDS = 60  # less than the viewer's server gives a whole request, whose end this program would outlive
@@ -55,13 +58,13 @@ def _limit() -> None:
             resource.setrlimit(limit, (most, most))
 
 
-def _datasets(file: h5py.File) -> tuple[dict[str, h5py.Dataset], dict[str, tuple[str, str]]]:
+def _datasets(file: "h5py.File") -> "tuple[dict[str, h5py.Dataset], dict[str, tuple[str, str]]]":
     """Return the arrays of numbers in the file itself by their paths, and what was left out, why, and the cure."""
     found: dict[str, h5py.Dataset] = {}
     left_out: dict[str, tuple[str, str]] = {}
     count = 0
 
-    def note(name: str, one: h5py.HLObject) -> bool | None:
+    def note(name: str, one: "h5py.HLObject") -> bool | None:
         nonlocal count
         count += 1
         if isinstance(one, h5py.Dataset) and one.shape:
@@ -77,7 +80,7 @@ def _datasets(file: h5py.File) -> tuple[dict[str, h5py.Dataset], dict[str, tuple
     return found, left_out
 
 
-def _why_left_out(one: h5py.Dataset) -> tuple[str, str] | None:
+def _why_left_out(one: "h5py.Dataset") -> tuple[str, str] | None:
     """Return why a dataset is not read, and what to do; None if it is read."""
     size_bytes = one.size * one.dtype.itemsize
     if one.external or one.is_virtual:
@@ -89,8 +92,8 @@ def _why_left_out(one: h5py.Dataset) -> tuple[str, str] | None:
 
 
 def _scans(
-    datasets: dict[str, h5py.Dataset], left_out: dict[str, tuple[str, str]], wanted: str
-) -> list[dict[str, h5py.Dataset]]:
+    datasets: "dict[str, h5py.Dataset]", left_out: dict[str, tuple[str, str]], wanted: str
+) -> "list[dict[str, h5py.Dataset]]":
     """Return the arrays of each scan: points, and what lies beside them in the same group and is as long."""
     may_be = [path for path, one in datasets.items() if _may_be_points(one)]
     if wanted in left_out:
@@ -123,11 +126,11 @@ def _scans(
     return scans
 
 
-def _lower(beside: dict[str, h5py.Dataset]) -> dict[str, h5py.Dataset]:
+def _lower(beside: "dict[str, h5py.Dataset]") -> "dict[str, h5py.Dataset]":
     return {name.lower(): one for name, one in beside.items()}
 
 
-def _may_be_points(one: h5py.Dataset) -> bool:
+def _may_be_points(one: "h5py.Dataset") -> bool:
     names = {name.lower() for name in one.dtype.names or ()}
     return {*"xyz"} <= names or (one.dtype.kind == "f" and one.ndim == 2 and one.shape[1] in range(3, 6))
 
