@@ -137,7 +137,7 @@ def test_what_stands_there_is_told_first():
     worse = score(0.9, 0.1, 0.8, metric="object_statistics", variant="segmented")
     worse = replace(worse, result=replace(worse.result, details=numbers))
     first, pixels, real = said(score(0.15, 0.1, 0.9), worse)
-    assert first == "Objects a scan, samples v reference: vehicle 4.0000 v 4.2500, pole 0.5000 v 4.8750."
+    assert first == "Objects a scan, samples v reference: vehicle 4.0 v 4.2, pole 0.5 v 4.9."
     assert pixels.startswith("Against pixel statistics: worse in 0 of 2 scores, better in 1 (bev_jsd), undecided in 1")
     assert real == (
         "Against real scans: worse in 1 of 2 scores (object_statistics), within noise in 1 (bev_jsd), undecided in 0."

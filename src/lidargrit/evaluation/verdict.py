@@ -153,7 +153,7 @@ def objects_a_scan(scores: Sequence[Score]) -> str:
         made, real = (score.result.details.get(name) for name in ("generated", "real"))
         if score.result.metric == "object_statistics" and made and real:
             number = "number_a_scan"
-            each = (f"{kind} {format_value(made[kind][number])} v {format_value(real[kind][number])}" for kind in real)
+            each = (f"{kind} {made[kind][number]:.1f} v {real[kind][number]:.1f}" for kind in real)
             return f"Objects a scan, samples v reference: {', '.join(each)}."
     return ""
 
