@@ -21,7 +21,7 @@ _SMALL = preset(
 
 PRESETS = {
     "dusty_small": _SMALL,
-    "dusty_small_v2": variant(
+    "dusty_small_2": variant(
         "DUSty-II, small: 64x256, for two CPU cores and minutes", _SMALL, {"model.variant": "dusty_2"}
     ),
     "dusty_kitti_odometry": preset(  # 19.5 M + 2.8 M parameters
