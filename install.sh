@@ -29,17 +29,18 @@ pip_is_configured() { "$python" -m pip config list 2>/dev/null | grep -qE "index
 by_uv() { uv pip install --python "$python" --index-strategy unsafe-best-match "$@"; }
 by_pip() { "$python" -m pip install --disable-pip-version-check --progress-bar on "$@"; }
 
-# pip says nothing while it unpacks and installs: a line whenever the environment has grown, until this script ends.
+# pip says nothing while it unpacks and installs: a line whenever the environment has grown, until this script has ended.
 tell_growth() {
     told=0
-    while sleep 8; do
+    while sleep 8 && kill -0 $$; do
         now=$(du -sm .venv | cut -f1)
         [ "$now" -eq "$told" ] || echo "installing: $now MB in .venv so far"
         told=$now
     done
 }
 tell_growth &
-trap 'kill $!' EXIT
+trap 'kill $! 2>/dev/null || :' EXIT
+trap 'exit 130' INT TERM
 
 if command -v uv >/dev/null 2>&1 && ! pip_is_configured; then
     by_uv "$@" || by_pip "$@"

@@ -56,7 +56,7 @@ def test_images_are_those_that_the_protocol_wants(number):
 
 
 def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
-    told_at_once = lambda preset, taken: dict.fromkeys(preset.training, 10**18)  # noqa: E731
+    told_at_once = lambda preset: dict.fromkeys(preset.training, 10**18)  # noqa: E731
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     load("kitti_360").write_example(tmp_path / "root", 1)
     (scan,) = (tmp_path / "root").rglob("*.bin")

@@ -17,16 +17,16 @@ def test_a_run_that_gives_its_stages_tells_what_it_learned_from_if_it_is_known(t
     config = DataConfig(train=("simulated:6:train",), val=(), columns=512, column_stride=8)
     images = load_range_images(config.train, config)
     (tmp_path / "donor").mkdir()
-    _write_trained_on(tmp_path / "first", images, str(tmp_path / "donor"))
+    _write_trained_on(tmp_path / "first", images, [str(tmp_path / "donor")])
     known = json.loads((tmp_path / "first" / "trained_on.json").read_text())["fingerprints"]
     assert len(known) == 6
     (tmp_path / "donor" / "trained_on.json").write_text('{"recordings": [], "fingerprints": ["ab"]}')
-    _write_trained_on(tmp_path / "second", images, str(tmp_path / "donor"))
+    _write_trained_on(tmp_path / "second", images, [str(tmp_path / "donor")])
     assert json.loads((tmp_path / "second" / "trained_on.json").read_text())["fingerprints"] == sorted([*known, "ab"])
     for number, bad in enumerate(('{"recordings": [[1]]}', '{"fingerprints": 3}', '{"drives": []}', "[]")):
         (tmp_path / "donor" / "trained_on.json").write_text(bad)
         with pytest.raises(CheckpointError, match=r"trained_on\.json, "):
-            _write_trained_on(tmp_path / f"bad{number}", images, str(tmp_path / "donor"))
+            _write_trained_on(tmp_path / f"bad{number}", images, [str(tmp_path / "donor")])
 
 
 def test_numbered_recordings_are_written_as_the_first_and_the_last(tmp_path):

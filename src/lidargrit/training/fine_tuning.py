@@ -19,7 +19,7 @@ _TIMES_OF_DEMO = 10  # as many scans seen as the demo's preset says, where there
 _ENOUGH_SCANS = 400  # for all of these; fewer scans are seen in proportion, but no fewer than the demo's preset says
 
 
-def divided(data: str, max_scans: int = 0) -> DataConfig:
+def divided(data: str, max_scans: int = 0, if_few: str = "add scans") -> DataConfig:
     """Divide a user's scans into train and val, by whole drives where there are several.
 
     The same drive in both would leak. Held out is the drive that is nearest to 15 % of the scans; where there is only
@@ -27,15 +27,12 @@ def divided(data: str, max_scans: int = 0) -> DataConfig:
 
     Args:
         data: name of a data set, or of a folder of scans.
+        if_few: cure of too few scans.
     """
     opened = open_source(data)
     dataset = opened.scans()
     if len(dataset) < 4:
-        raise DataError(
-            f"{counted_scans(len(dataset))} in {data}",
-            "at least 4, to hold one out",
-            "add scans, or name some to validate on with --val",
-        )
+        raise DataError(f"{counted_scans(len(dataset))} in {data}", "at least 4, to hold one out", if_few)
     source, split = f"{dataset.public_name()}:{dataset.root}", dataset.split
     scans = Counter(dataset.name(index).rpartition("/")[0] for index in range(len(dataset)))
     drives = sorted(scans)
@@ -76,7 +73,7 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
         settings: changed settings of the preset, as ``--set`` takes them.
         val: scans to validate on; some of the scans are held out if empty.
     """
-    config = _all_to_train(data, val) if val else divided(data)
+    config = _all_to_train(data, val) if val else divided(data, if_few="add scans, or name others with --val")
     own, made_by = read_config(locate(PRETRAINED)).sensor, load_sensor(sensor or config.sensor)
     columns, stride = columns_like(own, made_by)
     if made_by.height != own.height:
