@@ -141,7 +141,7 @@ def with_budget(preset: Preset, flops: float) -> Preset:
         share *= flops / spent
         for name in costs:
             config, scans = preset.settings_of(name), preset.settings_of(name).scans * share
-            if scans < config.batch_size / 2:
+            if not round(scans / config.batch_size):
                 raise ConfigError(
                     f"a budget of {flops:.2g} operations, {scans:.1f} scans for {preset.generator}'s stage {name!r}",
                     f"at least one batch of {config.batch_size} scans in every stage",

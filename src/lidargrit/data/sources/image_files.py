@@ -106,9 +106,10 @@ def _entries(path: Path) -> list[Path]:
     """Return what lies in a folder, or in the one folder below where it holds no scan itself."""
     try:
         found = [path] if path.is_file() else natural_order(path.iterdir())
+        if any(formats.candidates(one) and one.is_file() for one in found):  # ends at the first of many files
+            return found
         below = [one for one in found if one.is_dir() and not one.name.startswith(".")]
-        has_scans = any(formats.candidates(one) for one in found if one.is_file())
-        return _entries(below[0]) if len(below) == 1 and not has_scans else found
+        return _entries(below[0]) if len(below) == 1 else found
     except (OSError, ValueError):
         return []
 
