@@ -23,7 +23,6 @@ class SampleFacts(NamedTuple):
     """What the manifest of a folder of samples says of them and of their model.
 
     Args:
-        sensor: sensor of the samples.
         projection_variant: variant of the projection by which the model's training scans became images; "" if unknown.
         full_rows: rows in which every ray returns, with none in the others; None where rays may drop.
         weights_sha256: hash of the weights that generated the samples; "" if unknown.

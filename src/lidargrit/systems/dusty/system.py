@@ -71,7 +71,6 @@ class DustyConfig(Settings):
         variant: form of the published model. ``dusty_1`` drops every ray by a probability of its own; ``dusty_2`` also
             keeps or drops the scan as a whole; ``baseline`` generates a range image with its holes, and far pixels are
             read as no return.
-        latent_dim: length of a latent.
         channels: channels of the finest level of both networks; each of the four coarser levels has twice as many.
         max_channels: largest number of channels of any level.
         penalty_weight: gamma of the penalty on the discriminator's gradient at real images (R1).

@@ -29,7 +29,6 @@ class Decoder(Network):
     the program's.
 
     Args:
-        latent_dim: length of a latent.
         channels: number of channels of the finest level; each of the three coarser levels has twice as many.
         size: rows and columns of the image; see lidargrit.systems.lidargan.filled_rows.
         initial_std: standard deviation of new weights.
@@ -62,7 +61,6 @@ class Encoder(Network):
     Its convolutions are those of :class:`Decoder` in the opposite order.
 
     Args:
-        outputs: number of numbers.
         channels: number of channels of the finest level; each of the three coarser levels has twice as many.
         size: rows and columns of the image.
         initial_std: standard deviation of new weights.

@@ -38,7 +38,6 @@ class LidarGanConfig(Settings):
     """Networks and loss of LidarGAN; the defaults are the published ones.
 
     Args:
-        latent_dim: length of a latent.
         channels: number of channels of the finest level of both networks; each of the three coarser levels has twice as
             many.
         rows: number of rows that are generated: 24, 40, 56 or more in steps of 16.

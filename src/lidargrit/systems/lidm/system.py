@@ -41,7 +41,6 @@ class LatentAxes(nn.Module):
 
     Args:
         code_dim: number of channels of a latent.
-        axes: number of axes.
     """
 
     mean: Tensor

@@ -37,7 +37,6 @@ class R2flowConfig(Settings):
     """Channels, network and trainings of R2Flow.
 
     Args:
-        hdit: sizes of the network.
         reflectance: whether to learn the reflectance beside the range, as published; false where scans have none.
         reflow: settings of the trainings after the first, which straighten the flow; None for the first alone (1-RF).
     """

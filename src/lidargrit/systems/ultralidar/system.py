@@ -50,10 +50,6 @@ class CodebookCare(nn.Module):
     for 256 steps, k-means over the reservoir begins at the codes in use, and at random latents in place of the idle
     ones. It is done at most every 1,000 steps.
 
-    Args:
-        num_codes: number of codes.
-        code_dim: length of a code.
-
     Source:
         myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT). Its counter of idle steps begins at 0, as here, so that its k-means
         of the start comes after 256 steps.
