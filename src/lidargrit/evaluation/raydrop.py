@@ -9,7 +9,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.table import render
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
-from lidargrit.data.sources import DatasetSource, open_source
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.realism import CurveScore, SimulatedScans, StreetScans, compare, score_curves, tables
@@ -35,7 +35,7 @@ def streets_of(samples: str, config: EvalConfig) -> Streets | None:
     if public_name(config.protocol) != "streets" or not samples.startswith("simulated"):
         return None
     source = open_source(samples, config.data.bad_points)
-    streets = source.scans() if isinstance(source, DatasetSource) else None
+    streets = source.scans() if source.has_points else None
     return streets if isinstance(streets, Streets) else None
 
 
