@@ -50,11 +50,11 @@ def write_samples(
             :func:`lidargrit.data.sources.samples.read_condition` reads, so that the scan can be made again.
     """
     default = generator.completion_sampling if isinstance(condition, Observed) else generator.Sampling
-    sampling = default() if sampling is None else sampling
+    settings = default() if sampling is None else sampling
     manifest: dict[str, Any] = {
-        **sampling_identity(generator, run_folder, sampling),
+        **sampling_identity(generator, run_folder, settings),
         "generator": generator.public_name(),
-        "cost_per_scan": asdict(generator.cost(sampling)),
+        "cost_per_scan": asdict(generator.cost(settings)),
         "sensor": generator.sensor.to_json(),
     }
     if condition != NOTHING:
@@ -70,7 +70,7 @@ def write_samples(
     if condition != NOTHING and begun:
         _refuse_other_condition(folder, condition, {seed: where[seed] for seed in where.keys() - {*missing}})
     known = condition[[where[seed] for seed in missing]]
-    images = generator.stream(missing, sampling) if known == NOTHING else _sampled(generator, missing, known, sampling)
+    images = generator.stream(missing, settings) if known == NOTHING else _sampled(generator, missing, known, settings)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
         reporting.progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
