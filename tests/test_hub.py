@@ -41,7 +41,7 @@ def test_saved_and_read_in_the_hubs_way(tmp_path):
     again = Marginal.from_pretrained(str(tmp_path / "model"))
     assert all(torch.equal(of, again.state_dict()[name]) for name, of in model.state_dict().items())
     assert isinstance(Generator.from_pretrained(tmp_path / "model"), Marginal)
-    with pytest.raises(CheckpointError, match="holds a generator 'marginal'; wanted one of 'lidargrit'"):
+    with pytest.raises(CheckpointError, match="holds a generator 'marginal'; wanted a generator 'lidargrit'"):
         LidarGrit.from_pretrained(tmp_path / "model")
     model.save_pretrained(tmp_path / "bare")
     assert set(contents(tmp_path / "bare")) == {"config.json", "model.safetensors"}

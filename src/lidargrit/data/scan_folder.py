@@ -183,11 +183,7 @@ def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
 
 
 class KittiTree:
-    """The tree of KITTI odometry, with labels as SemanticKITTI has them.
-
-    Args:
-        out: folder of the tree.
-    """
+    """The tree of KITTI odometry, with labels as SemanticKITTI has them."""
 
     keeps_labels = True
 

@@ -29,7 +29,6 @@ class EvalConfig:
     """How two sets are compared.
 
     Args:
-        protocol: name of the protocol.
         metrics: names of metrics, in place of the protocol's; metrics of the protocol keep its definitions.
         variant: one definition for all metrics, in place of the protocol's.
         sensor: name or ``.json`` file of the sensor that scans are imaged with, in place of the protocol's.

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
+from torch import Tensor
 
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
@@ -55,7 +56,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     """Precision in which stages are trained where no preset names one."""
 
     trains: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """Stages of training in order, each with the names of the networks, here and in its objective, that it trains."""
+    """Stages of training in order, each with the names of the networks, here and in its objective, that it trains.
+
+    A stage takes place if its networks are there. The objective may be the network itself.
+    """
 
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
@@ -101,7 +105,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages of training, in their order; they may depend on ``config``."""
-        return tuple(stage for stage, *_ in self.trains)
+        there = dict(self.named_children())
+        return tuple(stage for stage, *names in self.trains if all(name in there for name in names))
 
     @property
     def full_rows(self) -> range | None:
@@ -131,7 +136,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Load the weights of a stage's trained objective."""
         for name in next(names for one, *names in self.trains if one == stage):
-            self.get_submodule(name).load_state_dict(objective.get_submodule(name).state_dict())
+            network = self.get_submodule(name)
+            trained = objective if type(objective) is type(network) else objective.get_submodule(name)
+            network.load_state_dict(trained.state_dict())
 
     def after_training(self) -> None:
         """Fit what depends on all trained stages."""
@@ -333,17 +340,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return cls.facts.lines(cls.capabilities, configuration.own_first(cls.Sampling()), cls.not_of_sampling)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> "Generator[Any, Any]":
-        """Make a generator with the weights that the system's authors published, or that their program saved.
-
-        Args:
-            files: one file for each of ``published_files``, in that order; code in them is not run.
-            config: sizes of the networks, used where the files do not tell them.
-            sensor: sensor whose rays are the pixels of the authors' images.
-
-        Raises:
-            CheckpointError: other files, or weights of other sizes.
-        """
+    def read_published(
+        cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel
+    ) -> tuple[ConfigT, dict[str, dict[str, Tensor]]]:
+        """Read the configuration and the weights in published files; see :meth:`from_published`."""
         able = [name for name in discovery.names("generators") if load_class(name).published_files]
         raise ConfigError(
             f"a generator {cls.public_name()!r}, of which nobody published weights",
@@ -370,22 +370,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
         """
         name = pretrained_model_name_or_path
-        generator = load(
-            located(
-                name,
-                revision=revision,
-                force_download=force_download,
-                token=token,
-                cache_dir=cache_dir,
-                local_files_only=local_files_only,
-            )
-        )
+        generator = load(located(name, revision, force_download, token, cache_dir, local_files_only))
         if not isinstance(generator, cls):
-            raise CheckpointError(
-                f"{name}, which holds a generator {generator.public_name()!r}",
-                f"one of {cls.public_name()!r}",
-                "read it with Generator.from_pretrained",
-            )
+            got, wanted = (f"a generator {each.public_name()!r}" for each in (generator, cls))
+            raise CheckpointError(f"{name}, which holds {got}", wanted, "read it with Generator.from_pretrained")
         return generator
 
 

@@ -13,7 +13,6 @@ _WANTED = "a run's folder, or USER/REPOSITORY on the Hugging Face hub"
 
 def located(
     name: str | Path,
-    *,
     revision: str | None,
     force_download: bool,
     token: str | bool | None,

@@ -1,9 +1,9 @@
 """A network with its configuration and sensor ⇄ the two files in which it is saved, here or on the Hugging Face hub."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar, final
 
 from torch import Tensor, nn
 
@@ -14,9 +14,11 @@ from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE, Job,
 from lidargrit.generation.hub import upload
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.quantization import WeightBits, with_quantized, without_quantized
-from lidargrit.nn.size import numbers_at_most
+from lidargrit.nn.size import numbers_at_most, numbers_of_files
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
+
+_NEVER_PUBLISHED = ("usage", "code_sums", "num_batches_tracked", "scale_m")  # buffers that no program's file holds
 
 RunT = TypeVar("RunT")
 
@@ -106,6 +108,42 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         generator = cls(config, sensor)
         load_exactly(generator, weights, source)
         return generator.eval()
+
+    @classmethod
+    @final
+    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Self:
+        """Make a generator with the weights that the system's authors published, or that their program saved.
+
+        Args:
+            files: one file for each of ``published_files``, in that order; code in them is not run.
+            config: sizes of the networks, used where the files do not tell them.
+            sensor: sensor whose rays are the pixels of the authors' images. Networks that know the rays keep those of
+                their training.
+
+        Raises:
+            CheckpointError: other files, or weights of other sizes.
+        """
+        config, networks = cls.read_published(files, config, sensor)
+        with numbers_of_files(files):
+            generator = cls(config, sensor)
+        for number, (name, weights) in enumerate(networks.items()):
+            network = generator.get_submodule(name)
+            own = network.state_dict()
+            kept = {each: own[each] for each in own if each.rpartition(".")[2] in _NEVER_PUBLISHED}
+            load_exactly(network, kept | weights, files[number % len(files)])
+        return generator.eval()
+
+    @classmethod
+    def read_published(
+        cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel
+    ) -> tuple[ConfigT, dict[str, dict[str, Tensor]]]:
+        """Read the configuration and the weights in published files; see :meth:`from_published`.
+
+        Returns:
+            the configuration, and the weights of each network by its name here, "" for the whole model; if there are
+            several files, one network of each.
+        """
+        raise NotImplementedError
 
     def save_pretrained(
         self,

@@ -20,7 +20,6 @@ class Measured:
     """What the training of one stage takes on this machine.
 
     Args:
-        stage: name of the stage.
         flops: floating-point operations of all steps.
         scans_per_s: number of training scans per second.
         seconds: predicted time of all steps.

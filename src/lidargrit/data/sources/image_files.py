@@ -30,7 +30,6 @@ class ImageFileSource(Source):
     """Range images as ``.npy``, in metres, 0 or what is not finite where nothing returned.
 
     Args:
-        text: name of the source.
         folder: file, or folder that was named.
         paths: files, in their order.
     """

@@ -43,7 +43,6 @@ class Synthesis(nn.Module):
     to the image.
 
     Args:
-        latent_dim: length of a latent.
         widths: channels of each level.
         size: rows and columns of the image, multiples of 16, with at least 32 rows.
         logits: number of maps of return logits beside the range; 0 for none.

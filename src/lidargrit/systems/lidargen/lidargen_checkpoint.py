@@ -27,7 +27,6 @@ class LidarGenCheckpoint(NamedTuple):
 
     Args:
         channels: number of channels of the finest level.
-        image_channels: number of channels of an image.
         sigmas: noise levels of the training, the largest first.
         weights: moving average of the weights, under the names of lidargrit.systems.lidargen.ncsn.
     """

@@ -109,12 +109,7 @@ class NcsnBlock(Block):
 
 
 class ResidualUnits(nn.ModuleDict):
-    """Units of ELU, convolution, ELU, convolution, each of them added to its input.
-
-    Args:
-        channels: number of channels.
-        units: number of units.
-    """
+    """Units of ELU, convolution, ELU, convolution, each of them added to its input."""
 
     def __init__(self, channels: int, units: int) -> None:
         names = [f"{unit}_{stage}_conv" for unit in range(1, units + 1) for stage in (1, 2)]
@@ -195,7 +190,6 @@ class Ncsn(Network):
     """The score of noisy images, which is the gradient of their log density.
 
     Args:
-        image_channels: number of channels of an image.
         channels: number of channels of the finest level, twice as many in the others; 128 are published.
     """
 

@@ -51,7 +51,6 @@ class R2dmCheckpoint(NamedTuple):
     """Sizes and weights in a checkpoint.
 
     Args:
-        unet: sizes of the network.
         reflectance: whether it generates reflectance beside the range.
         weights: moving average of the weights, under the names of lidargrit.systems.r2dm.unet.
     """

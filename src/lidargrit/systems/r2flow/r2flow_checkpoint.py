@@ -29,7 +29,6 @@ class R2flowCheckpoint(NamedTuple):
     """What a checkpoint tells of its network.
 
     Args:
-        hdit: sizes of the network.
         channels: number of channels of an image.
         distilled_steps: number of equal steps that the flow was distilled to; 0 if it was not.
         weights: moving average of the weights, under the names of lidargrit.systems.r2flow.hdit.

@@ -57,7 +57,6 @@ class SegmenterNetwork(nn.Module):
     """A small U-Net over the returns of a scan: range, height above the sensor, and elevation of every pixel.
 
     Args:
-        config: sizes of the network.
         sensor: the rays and limits of the range images.
 
     Source:

@@ -49,7 +49,6 @@ class Contents(NamedTuple):
 
     Args:
         schemas: name of each schema's type, by its number.
-        channels: channels by their numbers.
         places: chunks and messages, in the order of the file.
         counts: number of messages of each channel.
         cut_at: position from which the file cannot be read; 0 if it is whole.

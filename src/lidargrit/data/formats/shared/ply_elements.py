@@ -23,7 +23,6 @@ class Element(NamedTuple):
     """An element of a header.
 
     Args:
-        rows: number of its rows.
         properties: properties of each row, in order.
     """
 
