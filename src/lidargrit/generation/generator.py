@@ -13,12 +13,13 @@ from torch import Tensor
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import WEIGHTS_FILE, Job, is_bundle, locate, named_folder
+from lidargrit.data.run_folder import Job, is_bundle, locate, named_folder
 from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
+from lidargrit.generation.hub import located
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, download, read_saved
+from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.bits import ScanBits
@@ -351,30 +352,28 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         )
 
     @classmethod
-    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> "Generator[Any, Any]":
+    def from_pretrained(
+        cls,
+        pretrained_model_name_or_path: str | Path,
+        *,
+        revision: str | None = None,
+        force_download: bool = False,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+    ) -> "Generator[Any, Any]":
         """Read a generator from a folder, or from a repository of the Hugging Face hub.
 
-        Args:
-            name: folder of a run or of a published generator, or else "USER/REPOSITORY" on the hub.
-            revision: branch, tag or commit of the repository; its main branch if not given.
+        Its arguments are those of :func:`lidargrit.generation.hub.located`.
 
         Raises:
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
-            ConfigError: a revision of a folder, which has none.
         """
-        here = named_folder(name)
-        if here.is_dir() and revision is not None:
-            got = f"revision={revision!r} of {name}, which is a folder here"
-            raise ConfigError(
-                got, "a repository on the hub, or no revision", "leave it out, or start in another folder"
-            )
-        generator = load(here if here.is_dir() else download(str(name), revision, ["*.json", WEIGHTS_FILE]))
+        name = pretrained_model_name_or_path
+        generator = load(located(name, revision, force_download, token, cache_dir, local_files_only))
         if not isinstance(generator, cls):
-            raise CheckpointError(
-                f"{name}, which holds a generator {generator.public_name()!r}",
-                f"one of {cls.public_name()!r}",
-                "read it with Generator.from_pretrained",
-            )
+            got, wanted = (f"a generator {each.public_name()!r}" for each in (generator, cls))
+            raise CheckpointError(f"{name}, which holds {got}", wanted, "read it with Generator.from_pretrained")
         return generator
 
 
