@@ -40,7 +40,6 @@ class EvalConfig:
         pixel_statistics: whether every score gets that of pixel statistics of the reference beside it.
         samples_format: name of the program that wrote a folder of tensors; recognised from the first file if empty.
         device: name of the device that networks compute on.
-        data: settings of reading scans.
     """
 
     protocol: str = DEFAULT

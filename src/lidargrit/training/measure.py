@@ -21,9 +21,7 @@ class Measured:
 
     Args:
         flops: floating-point operations of all steps.
-        scans_per_s: number of training scans per second.
         seconds: predicted time of all steps.
-        device: name of the device that computes.
         peak_gib: largest memory that this process has held so far, in GiB.
     """
 

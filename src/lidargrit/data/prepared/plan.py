@@ -15,7 +15,6 @@ class PreparedSpec:
 
     Args:
         format: number of the format, raised whenever projection or simulation gives other pixels for the same scan.
-        version: version of lidargrit.
         source: source of the scans, as the user typed it.
         sensor: JSON of the sensor, with all its fine columns.
         variant: projection variant, ``exact`` or ``reference``.

@@ -82,7 +82,6 @@ class Prepared:
     """Size and content of a prepared folder.
 
     Args:
-        rows: number of rows of an image.
         columns: number of fine columns of an image.
         size: size of all shards, in bytes.
         seconds: time that the preparation took, in seconds.

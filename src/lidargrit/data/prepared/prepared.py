@@ -32,7 +32,6 @@ class FewerColumns:
 
     Args:
         images: store of images that are ``columns`` wide.
-        columns: number of columns of the stored images.
         wanted: number of columns of the new images, at most as many.
     """
 

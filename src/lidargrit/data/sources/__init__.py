@@ -147,7 +147,6 @@ class TensorSource(Source):
     """A folder of samples as another program writes them, in files of tensors.
 
     Args:
-        folder: folder of ``.pth`` files.
         samples_format: name of the sample format; recognised from the first file if empty.
     """
 

@@ -31,7 +31,6 @@ class Decoder(Network):
     Args:
         channels: number of channels of the finest level; each of the three coarser levels has twice as many.
         size: rows and columns of the image; see lidargrit.systems.lidargan.filled_rows.
-        initial_std: standard deviation of new weights.
 
     Source:
         Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019; sizes from
@@ -62,8 +61,6 @@ class Encoder(Network):
 
     Args:
         channels: number of channels of the finest level; each of the three coarser levels has twice as many.
-        size: rows and columns of the image.
-        initial_std: standard deviation of new weights.
     """
 
     def __init__(self, outputs: int, channels: int, size: tuple[int, int], initial_std: float = 0.02) -> None:

@@ -41,7 +41,6 @@ class R2dmConfig(Settings):
     """Channels and network of R2DM.
 
     Args:
-        unet: sizes of the U-Net.
         reflectance: whether reflectance is learned beside the range, as published; set it to false where scans have
             none, or for a sharper range (the authors' own remark).
         calibration_scans: number of scans sampled at the end of training to fit the threshold of the ``calibrated``

@@ -73,8 +73,6 @@ class EfficientUnet(Network):
 
     Args:
         images: number of channels of the input and of the output.
-        elevation_rad: elevation (H, W) of every pixel in radians.
-        azimuth_rad: azimuth (H, W) of every pixel in radians.
 
     Source:
         Nakashima and Kurazume, R2DM, ICRA 2024, after Saharia et al., Imagen, 2022 (Efficient U-Net); layers and names
