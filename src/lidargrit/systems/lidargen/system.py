@@ -175,19 +175,13 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel
     ) -> tuple[LidarGenConfig, dict[str, dict[str, Tensor]]]:
         """Read one checkpoint, which tells its sizes and noise levels."""
-        read = read_lidargen_checkpoint(files[0])
-        if read.image_channels not in (1, 2):
-            got, wanted = f"{files[0]} for images of {read.image_channels} channels", "range, or range and reflectance"
+        channels, image_channels, sigmas, weights = read_lidargen_checkpoint(files[0])
+        if image_channels not in (1, 2):
+            got, wanted = f"{files[0]} for images of {image_channels} channels", "range, or range and reflectance"
             raise CheckpointError(got, wanted, "use another")
-        read_config = LidarGenConfig(
-            channels=read.channels,
-            reflectance=read.image_channels > 1,
-            sigma_largest=float(f"{float(read.sigmas[0]):.6g}"),
-            sigma_smallest=float(f"{float(read.sigmas[-1]):.6g}"),
-            levels=len(read.sigmas),
-            steps_each=config.steps_each,
-        )
-        return read_config, {"network": read.weights}
+        largest, smallest = (float(f"{float(sigmas[at]):.6g}") for at in (0, -1))
+        sizes = (channels, image_channels > 1, largest, smallest, len(sigmas), config.steps_each)
+        return LidarGenConfig(*sizes), {"network": weights}
 
     def _counts(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int]:
         levels = self.config.levels if sampling.levels is None else sampling.levels

@@ -234,8 +234,8 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
 
         The grid of the configuration must have as many cells as the file's.
         """
-        read = read_ultralidar_checkpoint(files[0], config.autoencoder)
-        return UltraLidarConfig(read.autoencoder, read.prior, config.flips), {"": read.weights}
+        autoencoder, prior, weights = read_ultralidar_checkpoint(files[0], config.autoencoder)
+        return UltraLidarConfig(autoencoder, prior, config.flips), {"": weights}
 
     def _voxels(self, seed: int, sampling: VoxelSampling) -> Bool[Tensor, "1 z y x"]:
         """Sample one scan; seeds do not share a pass, so that none depends on another's."""
