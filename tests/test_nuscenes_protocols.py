@@ -80,6 +80,7 @@ def test_the_published_protocol_against_a_loop_over_points():
 def test_the_fair_protocol_has_a_row_for_each_laser():
     xyz, laser = street(0)
     sensor = load_protocol("fair-nuscenes").load_sensor()
+    assert sensor is not None
     assert (sensor.height, sensor.width, sensor.projection) == (ROWS, COLUMNS, "unfolding")
     image = lidargrit.project(Scan(torch.from_numpy(xyz), ring=torch.from_numpy(laser)), sensor)
     assert image.return_mask.sum(dim=1).tolist() == [AZIMUTHS] * ROWS
