@@ -38,6 +38,7 @@ class EvalSetRecord:
         data_set: name of the data set; "samples" for generated scans.
         sha256: hash of the pixels that were compared.
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
+        file_sha256: hash of the reference file that stood in for the scans; "" where these were here.
     """
 
     source: str
@@ -49,6 +50,7 @@ class EvalSetRecord:
     projection: str
     sha256: str
     weights_sha256: str = field(default="", compare=False)  # equal pixels are equal
+    file_sha256: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)
