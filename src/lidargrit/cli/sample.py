@@ -41,13 +41,14 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.nn.devices import usable_device
 
     seeds = seeds_in_a_row(options.seed, options.count)
-    run_folder, words = locate(options.run_folder), sampling_words(options.set)
-    if address := ray_address(options):
-        write_samples_on_ray(run_folder, options.out, seeds, words, address, options.device)
+    address, words = ray_address(options), sampling_words(options.set)
+    if address:
+        write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
         rank, world_size = rank_and_world_size(options.rank, options.world_size)
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-        generator = load(run_folder).to(usable_device(options.device or own))
+        device, run_folder = usable_device(options.device or own), locate(options.run_folder)
+        generator = load(run_folder).to(device)
         seeds = seeds[rank::world_size]
         write_samples(generator, run_folder, options.out, seeds, generator.parse_sampling(words))
     print(f"done: {counted_scans(len(seeds))} in {options.out}; {look_at(options.out)}")
