@@ -21,7 +21,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
-from lidargrit.nn.precision import Precision, without_autocast
+from lidargrit.nn.precision import Precision, in_full, products_in
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
 from lidargrit.scans.bits import ScanBits
@@ -31,7 +31,7 @@ from lidargrit.scans.fills import fill_from_nearest
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, TokenGrid
 
-_DECODED_AT_ONCE = 4  # scans; enough to keep a GPU busy, and more would only take memory: 35 MB a layer at 64x1024
+_DECODED_AT_ONCE = 4  # scans on a CPU, where more would only take memory: 35 MB a layer at 64x1024
 
 
 PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
@@ -57,7 +57,7 @@ class DecodingOfTokens(Settings):
             sampled at once; 0 samples them independently.
         decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
             quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
-            has instructions for it.
+            has instructions for it. ``tf32`` rounds what a GPU multiplies to 11 digits.
     """
 
     mask: PixelChoice = "auto"
@@ -172,7 +172,8 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     ) -> RangeImage:
         """Decode sampled tokens to scans: those that are wanted, and the rest of the last one's batch.
 
-        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size.
+        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size; on a GPU
+        all of them at once.
 
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
@@ -182,14 +183,17 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             condition: observed part of the scans, which a pixel decoder keeps.
         """
         images = []
-        for first in range(0, wanted, _DECODED_AT_ONCE):
-            some = slice(first, first + _DECODED_AT_ONCE)
-            grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
-            if self.pixels is not None and mask in ("auto", "pixels"):
-                part = None if condition is None else condition[some]
-                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
-            else:
-                images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
+        at_once = _DECODED_AT_ONCE if tokens.device.type == "cpu" else len(tokens)
+        for first in range(0, wanted, at_once):
+            some = slice(first, first + at_once)
+            grid = TokenGrid.unchecked(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
+            with products_in(pixels.precision):
+                if self.pixels is not None and mask in ("auto", "pixels"):
+                    part = None if condition is None else condition[some]
+                    images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
+                else:
+                    method = "threshold" if mask == "threshold" else "bernoulli"
+                    images.append(tokenizer.sample(grid, rngs[some], method))
         return RangeImage.cat(images)
 
     def observed_tokens(self, condition: Observed) -> Int[Tensor, "B T"]:
@@ -288,8 +292,8 @@ class PixelObjective(Objective):
         decoded = None
         if self._tokens is not None and self._decoding is not None:
             tokenizer = self._decoding.network(images.range_m.device)
-            with torch.no_grad(), without_autocast(images.range_m.device):  # as when scans are sampled
-                decoded = tokenizer.decode(TokenGrid(self._tokens(images).long(), tokenizer.num_codes))
+            with torch.no_grad(), in_full(images.range_m.device):  # as when scans are sampled
+                decoded = tokenizer.decode(TokenGrid.unchecked(self._tokens(images).long(), tokenizer.num_codes))
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
         else:
