@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -355,6 +356,14 @@ def test_tensorboard_draws_what_the_log_says(tmp_path):
     seen = EventAccumulator(str(tmp_path)).Reload().Scalars("loss/train")
     assert [(event.step, event.value) for event in seen] == [(4, 0.5), (8, 0.125)]
     assert [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [0.5, 0.125]
+
+
+def test_the_log_is_written_without_tensorboard(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    log = Log(tmp_path, 0)
+    log.write("train", 4, 1.0, {"loss": 0.5})
+    log.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["log.jsonl"]
 
 
 def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
