@@ -289,7 +289,8 @@ def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
     assert not [path for path in (tmp_path / "run").rglob("*") if path.name.startswith(".")]
 
 
-def test_pictures_change_nothing(tmp_path, whole):
+def test_pictures_change_nothing(tmp_path, whole, monkeypatch):
+    monkeypatch.setattr("lidargrit.viewer._matplotlib._DOTS_PER_INCH", 20)
     every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
     train(load_preset("lidargrit_demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
     plain, drawn = (
