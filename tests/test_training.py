@@ -4,8 +4,6 @@ import functools
 import json
 import math
 import os
-import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,9 +26,9 @@ from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.r2flow.rectified_flow import ReflowConfig
-from lidargrit.training import check_folder, measure, train, training_flops
+from lidargrit.training import check_folder, train
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
-from lidargrit.training.log import Log, read_log
+from lidargrit.training.log import read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
 from lidargrit.training.stage import StageTraining
 from lidargrit.viewer import plot_progress
@@ -298,13 +296,6 @@ def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
     assert first.range_m.shape == (2, 64, 64)
 
 
-def test_stages_use_their_own_settings():
-    preset = load_preset("lidargrit_demo", ["training.transformer.learning_rate=0.5"])
-    assert preset.training["transformer"].learning_rate == 0.5
-    assert preset.training["tokenizer"] == load_preset("lidargrit_demo").training["tokenizer"]
-    assert replace(preset, seed=1) != preset
-
-
 def test_a_run_goes_on_though_the_words_about_its_preset_have_changed(tmp_path):
     preset = load_preset("marginal")
     older = replace(preset, title="another title", published="other words")
@@ -370,57 +361,6 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
     held += [parameter.grad for parameter in vqvae.parameters() if parameter.grad is not None]
     held += [value for state in optimiser.state.values() for name, value in state.items() if name != "step"]
     assert memory_of_weights(vqvae) == sum(tensor.nbytes for tensor in held)
-
-
-def test_a_measured_plan_tells_operations_time_and_memory():
-    preset = load_preset("lidargrit_demo", TINY)
-    lines = [stage.as_text() for stage in measure(preset)]
-    for line, (stage, flops) in zip(lines, training_flops(preset).items(), strict=True):
-        wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
-        assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
-
-
-def test_lines_that_are_no_entries_of_a_log_are_passed_over(tmp_path):
-    good = '{"scans_seen": 4, "split": "train", "seconds": 1.5}\n'
-    bad = [
-        "{}",
-        "[]",
-        "null",
-        '{"scans_seen": "4", "seconds": 1}',
-        "[" * 50_000,
-        '{"a": 1e400}',
-        '{"scans_seen": 4, "se',
-    ]
-    content = "".join(f"{line}\n" for line in (good.strip(), *bad, good.strip())).encode() + b"\xff\xfe"
-    (tmp_path / "log.jsonl").write_bytes(content)
-    assert [entry["seconds"] for entry in read_log(tmp_path / "log.jsonl")] == [1.5, 1.5]
-    Log(tmp_path, 4).write("val", 8, 2.0, {"loss": float("nan")})
-    lines = (tmp_path / "log.jsonl").read_text().splitlines()
-    assert lines[:-1] == [good.strip()] * 2
-    assert json.loads(lines[-1])["loss"] is None
-
-
-def test_tensorboard_draws_what_the_log_says(tmp_path):
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-    log = Log(tmp_path, 0)
-    log.write("train", 4, 1.0, {"loss": 0.5})
-    log.write("train", 8, 2.0, {"loss": 0.25})
-    log.close()
-    again = Log(tmp_path, 4)  # killed after the checkpoint at 4 scans
-    again.write("train", 8, 2.0, {"loss": 0.125})
-    again.close()
-    seen = EventAccumulator(str(tmp_path)).Reload().Scalars("loss/train")
-    assert [(event.step, event.value) for event in seen] == [(4, 0.5), (8, 0.125)]
-    assert [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [0.5, 0.125]
-
-
-def test_the_log_is_written_without_tensorboard(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    log = Log(tmp_path, 0)
-    log.write("train", 4, 1.0, {"loss": 0.5})
-    log.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["log.jsonl"]
 
 
 def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):
