@@ -12,7 +12,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.echoes import Echoes, detect_echoes, edges
-from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.mesh import Finish, Mesh, Objects
 from lidargrit.simulator.power import (
     BeamNoise,
     Lasers,
@@ -22,15 +22,20 @@ from lidargrit.simulator.power import (
     reflectance,
     return_probability,
 )
-from lidargrit.simulator.tracing import Tracer, in_reach
+from lidargrit.simulator.tracing import Tracer, in_reach, objects_in_reach
 
 
 @runtime_checkable
 class ObservableScene(Protocol):
     """Interface of a scene that a sensor can observe."""
 
-    def mesh(self, time_s: float = 0.0) -> Mesh:
-        """Return the triangles at a time, in seconds."""
+    @property
+    def standing(self) -> Mesh:
+        """Triangles of all that is no kept object."""
+        ...
+
+    def objects(self, time_s: float = 0.0) -> Objects:
+        """Return the kept objects at a time, in seconds."""
         ...
 
     def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
@@ -157,8 +162,10 @@ def observe_scene(
     looked, beam_noise = beams.columns(kept), beam_noise.columns(kept)
 
     elevations_rad = float(beams.elevation_rad.min()), float(beams.elevation_rad.max())
-    mesh = in_reach(scene.mesh(config.time_s), poses, elevations_rad, sensor.range_max_m)
-    tracer, surfaces = Tracer(mesh, sensor.range_max_m), Surfaces.of(mesh, model, config.wet)
+    mesh = in_reach(scene.standing, poses, elevations_rad, sensor.range_max_m)
+    objects = objects_in_reach(scene.objects(config.time_s), poses, sensor.range_max_m)
+    finish = Finish.join([mesh.finish(), objects.finish()])
+    tracer, surfaces = Tracer(mesh, sensor.range_max_m, objects), Surfaces.of(finish, model, config.wet)
     rays = looked.rays(*poses)
     first = tracer.cast(*rays)
     range_m = first.range_m.reshape(looked.azimuth_rad.shape)
@@ -170,7 +177,7 @@ def observe_scene(
     echoes = detect_echoes(tracer, surfaces, rays, first, edge, model)
     limits_m = sensor.range_min_m, sensor.range_max_m
     lasers = Lasers.of(sensor, model)
-    seen = _measure(mesh, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
+    seen = _measure(finish, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
     fired_s = np.broadcast_to(looked.turn * np.float32(REVOLUTION_S), seen.range_m.shape)
     return replace(seen, fired_s=fired_s) if config.motion else seen
 
@@ -189,15 +196,15 @@ def _beside(
     return np.roll(found[0], 1, axis=1), found[1]
 
 
-def _object_gains(mesh: Mesh, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
+def _object_gains(finish: Finish, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
     """Sample the natural log of the gain of every object by its number; what is no single object has none."""
-    gains = rng.standard_normal(int(mesh.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
+    gains = rng.standard_normal(int(finish.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
     gains[0] = 0
     return gains
 
 
 def _measure(
-    mesh: Mesh,
+    finish: Finish,
     surfaces: Surfaces,
     echoes: Echoes,
     beams: Beams,
@@ -210,9 +217,9 @@ def _measure(
 ) -> Observation:
     """Decide by chance which echoes are noticed, and what is read from them."""
     shape = beams.azimuth_rad.shape
-    label = np.append(mesh.label, np.uint16(0))[echoes.triangle]
-    instance = np.append(mesh.instance, np.int32(0))[echoes.triangle]
-    of_object = _object_gains(mesh, scene_rng, model)[instance]
+    label = np.append(finish.label, np.uint16(0))[echoes.triangle]
+    instance = np.append(finish.instance, np.int32(0))[echoes.triangle]
+    of_object = _object_gains(finish, scene_rng, model)[instance]
     log_gain = (lasers.log_gain + beam_noise.patch).ravel() + of_object
     level = levels(echoes.power, log_gain, model)
     clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])

@@ -10,7 +10,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS, is_on_car
 from lidargrit.simulator.materials import ASPHALT, CONCRETE, MATERIALS, Material
-from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.mesh import Finish
 
 _PATCH_AT_LEAST_DEG = 0.01  # finer than any sensor's columns; every patch of a ring takes memory
 _EVEN_RAD = 1e-4  # by which equal steps may differ, because of rounding; those of lasers differ by far more
@@ -122,10 +122,10 @@ class Surfaces:
     mottle: Float32[np.ndarray, " m"]
 
     @classmethod
-    def of(cls, mesh: Mesh, model: RaydropModel, wet: float = 0.0) -> "Surfaces":
-        """Look up the materials of a mesh, on ground between dry (``wet`` 0) and soaked (1)."""
-        albedo = np.append(mesh.albedo, np.float32(0))
-        material = np.append(mesh.material, np.uint8(len(model.materials)))
+    def of(cls, finish: Finish, model: RaydropModel, wet: float = 0.0) -> "Surfaces":
+        """Look up the materials of triangles, on ground between dry (``wet`` 0) and soaked (1)."""
+        albedo = np.append(finish.albedo, np.float32(0))
+        material = np.append(finish.material, np.uint8(len(model.materials)))
         nothing = Material("nothing")
         diffuse, gloss, lobe_power, retro, passes, mottle = (
             np.array([getattr(m, name) for m in (*model.materials, nothing)], np.float32)
