@@ -20,12 +20,14 @@ class Windows:
         azimuth_rad: azimuth of the object's middle.
         half_rad: half the width of the window; pi for a box around an origin.
         slope: lowest and highest ratio of height to way over the ground.
+        origins_m: lowest and highest coordinates of the origins.
     """
 
     nearest_m: Float32[np.ndarray, " n"]
     azimuth_rad: Float64[np.ndarray, " n"]
     half_rad: Float64[np.ndarray, " n"]
     slope: Float32[np.ndarray, "n 2"]
+    origins_m: Float32[np.ndarray, "2 3"]
 
     @classmethod
     def of(cls, objects: Objects, origins_m: Float32[np.ndarray, "r 3"]) -> "Windows":
@@ -34,7 +36,8 @@ class Windows:
         A ray from an origin that lies aside by no more than a radius meets a box only if a parallel ray from the
         middle meets the box within that radius. So sensors that move during a revolution need nothing more.
         """
-        low, high = origins_m.min(axis=0).astype(np.float64), origins_m.max(axis=0).astype(np.float64)
+        origins = np.stack((origins_m.min(axis=0), origins_m.max(axis=0)))
+        low, high = origins.astype(np.float64)
         middle, aside_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + _SPARE_M
         box = np.stack([shape.box_m for shape in objects.shapes])  # (n, 2, 3)
         pick = np.array([(i >> 2 & 1, i >> 1 & 1, i & 1) for i in range(8)])
@@ -43,7 +46,7 @@ class Windows:
         centre = corner.mean(axis=1)
         radius = np.linalg.norm(corner[..., :2] - centre[:, None, :2], axis=-1).max(axis=1)
         away = np.hypot(centre[:, 0], centre[:, 1])
-        apart = away - radius - aside_m
+        apart = np.maximum(_gaps_m(objects.frame, box, middle), away - radius) - aside_m
         around = apart <= _SPARE_M
         azimuth = np.arctan2(centre[:, 1], centre[:, 0])
         far = np.hypot(corner[..., 0], corner[..., 1])
@@ -57,11 +60,21 @@ class Windows:
         slope[around] = -np.inf, np.inf
         upright = np.maximum(np.maximum(bottom, -top), 0)
         nearest = np.where(around, 0, np.hypot(np.maximum(apart, 0), upright))
-        return cls(nearest.astype(np.float32), azimuth, half, slope.astype(np.float32))
+        return cls(nearest.astype(np.float32), azimuth, half, slope.astype(np.float32), origins)
+
+
+def _gaps_m(
+    frame: Float64[np.ndarray, "n 4 4"], box_m: Float64[np.ndarray, "n 2 3"], eye_m: Float64[np.ndarray, "3"]
+) -> Float64[np.ndarray, " n"]:
+    """Return how far an eye stands from upright boxes, over the ground; frames turn and stretch, heights may shear."""
+    stretch = np.linalg.norm(frame[:, :2, :2], axis=1)
+    local = np.einsum("nij,ni->nj", frame[:, :2, :2], eye_m[:2] - frame[:, :2, 3]) / stretch
+    low, high = box_m[:, 0, :2] * stretch, box_m[:, 1, :2] * stretch
+    return np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0), axis=1)
 
 
 class SortedRays:
-    """Rays by azimuth.
+    """Rays in the order of their azimuths, so that a window is a slice.
 
     Args:
         directions: vectors of the rays.
@@ -71,28 +84,23 @@ class SortedRays:
         azimuth = np.arctan2(directions[:, 1], directions[:, 0])
         step = ((azimuth + np.float32(np.pi)) * np.float32(_STEPS / (2 * np.pi))).astype(np.int32)
         step = np.minimum(step, _STEPS - 1).astype(np.uint16)
-        self._order = np.argsort(step, kind="stable")
-        self._step = step[self._order]
-        sorted_ = directions[self._order]
-        flat = np.sqrt(sorted_[:, 0] ** 2 + sorted_[:, 1] ** 2)
-        self._slope = sorted_[:, 2] / np.maximum(flat, np.float32(1e-9))
+        self.order = np.argsort(step, kind="stable")
+        self._step = step[self.order].astype(np.int64)
+        flat = np.sqrt(directions[:, 0] ** 2 + directions[:, 1] ** 2)
+        self.slope = (directions[:, 2] / np.maximum(flat, np.float32(1e-9)))[self.order]
 
-    def within(self, windows: Windows, which: int) -> Int64[np.ndarray, " m"]:
-        """Return the indices of the rays that lie in the window of one object."""
-        low, high = windows.slope[which]
-        parts = []
-        for start, stop in self._spans(windows.azimuth_rad[which], windows.half_rad[which]):
-            slope = self._slope[start:stop]
-            parts.append(self._order[start:stop][(slope >= low) & (slope <= high)])
-        return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-    def _spans(self, azimuth_rad: float, half_rad: float) -> list[tuple[int, int]]:
-        """Return where rays of an interval of azimuth begin and end: two spans where it wraps."""
+    def slices(self, windows: Windows) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, "s 2"]]:
+        """Return objects, and from where to where rays lie in the azimuths of each; a window that wraps has two."""
         scale = _STEPS / (2 * np.pi)
-        low, high = (int(np.floor((azimuth_rad + np.pi + side * half_rad) * scale)) + side for side in (-1, 1))
-        if high - low >= _STEPS:
-            return [(0, len(self._step))]
-        low, high = low % _STEPS, high % _STEPS
-        start, stop = np.searchsorted(self._step, np.array([low, high], np.uint16), side="left")
-        stop = int(np.searchsorted(self._step, np.uint16(high), side="right"))
-        return [(int(start), stop)] if low <= high else [(int(start), len(self._step)), (0, stop)]
+        middle, half = (windows.azimuth_rad + np.pi) * scale, windows.half_rad * scale
+        low, high = np.floor(middle - half) - 1, np.floor(middle + half) + 1
+        every = high - low >= _STEPS
+        low, high = np.where(every, 0, low), np.where(every, _STEPS - 1, high)
+        objects, spans = [], []
+        for turn in (-_STEPS, 0, _STEPS):
+            start = np.searchsorted(self._step, low + turn, side="left")
+            stop = np.searchsorted(self._step, high + turn, side="right")
+            some = np.flatnonzero(stop > start)
+            objects.append(some)
+            spans.append(np.stack((start, stop), axis=1)[some])
+        return np.concatenate(objects), np.concatenate(spans)

@@ -11,6 +11,7 @@ from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.ray_windows import SortedRays, Windows
 
 _MARGIN_RAD = 0.01  # for the width of beams, and for the turn of a car during a revolution
+_LARGEST_M = 30.0  # no kept object reaches farther from its foot
 NOTHING = -1  # the triangle of a ray that meets none
 
 
@@ -64,8 +65,9 @@ def in_reach(
 
 def objects_in_reach(objects: Objects, poses: Sequence[Float64[np.ndarray, "4 4"]], range_max_m: float) -> Objects:
     """Leave out objects that stand farther away than the longest range of interest, whichever pose counts."""
-    origins_m = np.stack([pose[:3, 3] for pose in poses]).astype(np.float32)
-    return objects.select(Windows.of(objects, origins_m).nearest_m < range_max_m) if len(objects) else objects
+    reach_m = range_max_m + _LARGEST_M
+    apart_m = [np.linalg.norm(objects.frame[:, :3, 3] - pose[:3, 3], axis=1) for pose in poses]
+    return objects.select(np.min(apart_m, axis=0) < reach_m)
 
 
 class Tracer:
@@ -81,6 +83,7 @@ class Tracer:
         self._reach_m = min(reach_m, 1e30)  # Embree's own infinity is about 1e37
         self._mesh = EmbreeTriangles(mesh.triangles_m)
         self._objects = objects or Objects.none()
+        self._windows: Windows | None = None
         counts = [len(mesh), *(len(shape) for shape in self._objects.shapes)]
         self._first_triangle = np.cumsum(counts)[:-1].astype(np.int32)
 
@@ -98,55 +101,72 @@ class Tracer:
         """
         if len(directions) == 0:
             return Hits(np.empty(0, np.float32), np.empty(0, np.int32), np.empty(0, np.float32))
-        start_m = origins_m if beyond_m is None else origins_m + directions * beyond_m[:, None]
-        within_m = self._reach_m if beyond_m is None else np.float32(self._reach_m) - beyond_m
-        range_m, triangle, normal = self._mesh.cast(start_m, directions, within_m)
-        if beyond_m is not None:
-            range_m += beyond_m
-        missed = triangle < 0
-        cos = _cosines(normal, directions, normal)
-        cos[missed] = 0  # the normal is not written there
-        hits = Hits(range_m, triangle, cos)
+        rays = SortedRays(directions)
+        order, sorted_ = rays.order, directions[rays.order]
+        beyond = np.zeros(len(order), np.float32) if beyond_m is None else beyond_m[order]
+        start_m = origins_m[order] + sorted_ * beyond[:, None]
+        range_m, triangle, normal = self._mesh.cast(start_m, sorted_, np.float32(self._reach_m) - beyond)
+        range_m[triangle < 0] = self._reach_m
+        range_m += beyond
         if len(self._objects):
-            range_m[missed] = self._reach_m
-            self._cast_at_objects(origins_m, start_m, directions, beyond_m, hits)
-            missed = hits.triangle < 0
-        range_m[missed] = np.inf
+            self._cast_at_objects(
+                self._windows_from(origins_m), rays, (start_m, sorted_, beyond), (range_m, triangle, normal)
+            )
+        hits = Hits(np.empty_like(range_m), np.empty_like(triangle), np.empty_like(range_m))
+        missed = triangle < 0
+        range_m[missed], normal[missed] = np.inf, 0  # the normal is not written there
+        length = np.sqrt(np.einsum("ni,ni->n", normal, normal))
+        cos = np.abs(np.einsum("ni,ni->n", normal, sorted_)) / np.maximum(length, np.float32(1e-30))
+        hits.range_m[order], hits.triangle[order] = range_m, triangle
+        hits.cos_incidence[order] = np.minimum(cos, np.float32(1))
         return hits
 
+    def _windows_from(self, origins_m: Float32[np.ndarray, "n 3"]) -> Windows:
+        """Return the windows of a revolution's rays, which are those of its parts too."""
+        low, high = origins_m.min(axis=0), origins_m.max(axis=0)
+        if (
+            self._windows is None
+            or (low < self._windows.origins_m[0]).any()
+            or (high > self._windows.origins_m[1]).any()
+        ):
+            self._windows = Windows.of(self._objects, origins_m)
+        return self._windows
+
     def _cast_at_objects(
-        self,
-        origins_m: Float32[np.ndarray, "n 3"],
-        start_m: Float32[np.ndarray, "n 3"],
-        directions: Float32[np.ndarray, "n 3"],
-        beyond_m: Float32[np.ndarray, " n"] | None,
-        hits: Hits,
+        self, windows: Windows, rays: SortedRays, cast: tuple[np.ndarray, ...], found: tuple[np.ndarray, ...]
     ) -> None:
-        """Write nearer hits on kept objects into hits; the nearest objects come first, and spare rays at the rest."""
-        windows = Windows.of(self._objects, origins_m)
-        order = np.argsort(windows.nearest_m)
-        rays = SortedRays(directions)
+        """Write nearer hits on kept objects into what was found; the nearest objects come first, and spare the rest.
+
+        Args:
+            windows: which rays can meet each object.
+            rays: the rays in the order of all that follows.
+            cast: where each ray starts (n, 3), where it goes (n, 3), and the range there (n).
+            found: range (n), triangle (n), and normal (n, 3) of what each met so far.
+        """
+        start_m, directions, beyond_m = cast
+        range_m, triangle, normal = found
         back = np.linalg.inv(self._objects.frame).astype(np.float32)
         at_m = self._objects.frame[:, :3, 3].astype(np.float32)
-        for which in order[windows.nearest_m[order] < self._reach_m]:
-            ray = rays.within(windows, which)
-            ray = ray[hits.range_m[ray] > windows.nearest_m[which]]
+        objects, spans = rays.slices(windows)
+        near_first = np.argsort(windows.nearest_m[objects], kind="stable")
+        for which, (first, last) in zip(objects[near_first].tolist(), spans[near_first].tolist(), strict=True):
+            nearest, (low, high) = windows.nearest_m[which], windows.slope[which]
+            if nearest > self._reach_m:
+                break
+            slope = rays.slope[first:last]
+            ray = ((slope >= low) & (slope <= high) & (range_m[first:last] > nearest)).nonzero()[0]
             if len(ray) == 0:
                 continue
+            ray += first
             turn = back[which, :3, :3]
             start, direction = (start_m[ray] - at_m[which]) @ turn.T, directions[ray] @ turn.T
-            begun_m = 0 if beyond_m is None else beyond_m[ray]
-            range_m, triangle, normal = self._objects.shapes[which].kept.cast(
-                start, direction, hits.range_m[ray] - begun_m
-            )
-            met = np.flatnonzero(triangle >= 0)
-            if len(met) == 0:
-                continue
-            ray, normal = ray[met], normal[met]
-            hits.range_m[ray] = (range_m + begun_m)[met]
-            hits.triangle[ray] = triangle[met] + self._first_triangle[which]
-            # Normals turn by the inverse's transpose.
-            hits.cos_incidence[ray] = _cosines(normal, direction[met], normal @ turn)
+            kept, begun_m = self._objects.shapes[which].kept, beyond_m[ray]
+            further_m, met, facing = kept.cast(start, direction, range_m[ray] - begun_m)
+            nearer = (met >= 0).nonzero()[0]
+            ray = ray[nearer]
+            range_m[ray] = (further_m + begun_m)[nearer]
+            triangle[ray] = met[nearer] + self._first_triangle[which]
+            normal[ray] = facing[nearer] @ turn  # normals turn by the inverse's transpose
 
     def cast_through(
         self,
@@ -178,12 +198,3 @@ class Tracer:
             behind = self.cast(origins_m[on], directions[on], skin)
             range_m[on], triangle[on], cos[on] = behind.range_m, behind.triangle, behind.cos_incidence
         return Hits(range_m, triangle, cos), light
-
-
-def _cosines(
-    normal: Float32[np.ndarray, "n 3"], direction: Float32[np.ndarray, "n 3"], upright: Float32[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, " n"]:
-    """Return cosines of incidence: normals and rays in one frame, and the normals where rays have unit length."""
-    length = np.sqrt(np.einsum("ni,ni->n", upright, upright))
-    cos = np.abs(np.einsum("ni,ni->n", normal, direction)) / np.maximum(length, np.float32(1e-30))
-    return np.minimum(cos, np.float32(1))

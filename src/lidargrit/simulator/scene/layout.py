@@ -87,11 +87,11 @@ def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> li
     lots.append(np.column_stack((rng.normal(0, 50, count), rng.normal(0, 34, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
-    trees_of = make_trees(rng, plan, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
+    wood = make_trees(rng, plan, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
     count = rng.poisson({"city": 60, "suburb": 230, "country": 50}[plan.theme] * green)
     points = [np.column_stack((rng.normal(0, 30, count), rng.normal(0, 13, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
-    return [trees_of, make_bushes(rng, u, v, plan.level_m[1])]
+    return [*wood, make_bushes(rng, u, v, plan.level_m[1])]
 
 
 def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:

@@ -31,9 +31,13 @@ def _ball(rng: np.random.Generator, count: int) -> Float[np.ndarray, "n 3"]:
 
 
 @cache
-def tree_shape(variant: int) -> Shape:
-    """Return one tree: a trunk, limbs, and a tuft of leaves around the end of each; made once, from its own seed."""
+def tree_shapes(variant: int) -> tuple[Shape, Shape]:
+    """Return one tree, made once, from its own seed: its trunk, and limbs with a tuft of leaves around each end.
+
+    Many rays pass below a crown; in two shapes they are cast at the trunk alone.
+    """
     rng, builder = np.random.default_rng((74, variant)), ShapeBuilder(*_MATERIALS)
+    stem = ShapeBuilder(*_MATERIALS)
     habit = variant % len(_HABITS)
     tall, bare, wide, number = np.array(_HABITS[habit]) * rng.uniform(0.85, 1.15, 4)
     foot = bare * tall
@@ -44,7 +48,7 @@ def tree_shape(variant: int) -> Shape:
     spine = np.column_stack((bend * tall * 0.12, -0.3 + (high * tall + 0.3) * share))
     radius = thick * (1.25 - 0.9 * share)
     radius[0] *= 1.3
-    builder.add(_TRUNK, sweep(spine, radius, 10))
+    stem.add(_TRUNK, sweep(spine, radius, 10))
     count = 36 if habit == _FIR else 22
     level = np.sort(rng.uniform(0.0, 1.0, count))
     way = np.arange(count) * 2.399963 + rng.normal(0, 0.3, count)
@@ -72,7 +76,7 @@ def tree_shape(variant: int) -> Shape:
     face = np.pi * wide * (tall - foot) / 2 * (0.55 if habit == _FIR else 1.0)
     leaf = np.sqrt(rng.uniform(1.7, 2.8) * face / (0.65 * number))
     builder.add(_LEAVES, leaves(centre, leaf * rng.uniform(0.75, 1.25, len(home))))
-    return builder.build()
+    return stem.build(), builder.build()
 
 
 @cache
@@ -123,8 +127,11 @@ def _batch(
 def make_trees(
     rng: np.random.Generator, plan: StreetPlan, u_m: Num[np.ndarray, " n"], v_m: Num[np.ndarray, " n"],
     size: float = 1.0, rise_m: float = 0.0,
-) -> ObjectBatch:  # fmt: skip
-    """Sample trees; ``size`` 1 is a street of trees of about 10 m. Near the road none has low branches."""
+) -> list[ObjectBatch]:  # fmt: skip
+    """Sample trees, trunks and crowns apart; ``size`` 1 is a street of trees of about 10 m.
+
+    Near the road none has low branches.
+    """
     count = len(u_m)
     over_road = np.abs(v_m) < max(plan.edge_m) + 4.5
     variant = rng.integers(0, TREES, count)
@@ -135,8 +142,8 @@ def make_trees(
     upwards = grown * np.where(over_road, np.maximum(1.0, 3.2 / np.maximum(2.4 * grown, 1.0)), 1.0)
     stretch = np.column_stack((grown, grown * rng.uniform(0.9, 1.1, count), upwards))
     placements = Placements.of(u_m, v_m, rng.uniform(0, 2 * np.pi, count), rise_m=rise_m)
-    shapes = [tree_shape(int(v)) for v in variant]
-    return _batch(rng, shapes, stretch, rng.uniform(0.3, 0.6, count), placements)
+    shapes, green = [tree_shapes(int(v)) for v in variant], rng.uniform(0.3, 0.6, count)
+    return [_batch(rng, [pair[part] for pair in shapes], stretch, green, placements) for part in (0, 1)]
 
 
 def make_bushes(
