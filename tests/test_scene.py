@@ -9,11 +9,12 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
+from lidargrit.simulator.scene.body_types import BODY_TYPES
 from lidargrit.simulator.scene.layout import driving, parked
 from lidargrit.simulator.scene.objects import Placements
 from lidargrit.simulator.scene.settlement import lay_out_houses
 from lidargrit.simulator.scene.street_plan import sample_street_plan
-from lidargrit.simulator.scene.vehicles import make_vehicles
+from lidargrit.simulator.scene.vehicles import make_vehicles, vehicle_shape
 
 THEMES = ("city", "suburb", "country")
 SEEDS = range(12)
@@ -158,10 +159,11 @@ def test_houses_have_windows(meshes):
     assert min(shares) > 0.005
 
 
-def test_the_number_of_triangles_is_bounded(meshes):
-    counts = np.array([len(mesh) for mesh in meshes.values()])
-    assert 25_000 < np.median(counts) < 55_000
-    assert counts.max() < 90_000
+def test_the_number_of_triangles_is_bounded(scenes, meshes):
+    of_the_street = np.array([len(scene.standing) for scene in scenes.values()])  # these are built anew for every scan
+    assert 4_000 < np.median(of_the_street) < 25_000
+    assert of_the_street.max() < 60_000
+    assert np.median([len(mesh) for mesh in meshes.values()]) > 250_000
 
 
 def _slow_sight(town, point, eye):
@@ -203,16 +205,41 @@ def test_our_car_passes_what_is_drawn_in_detail(scenes):
         assert scene.plan.nearest_approach_m(way).max() < 3.1  # half of what lies between two of the places that count
 
 
-def test_far_cars_are_as_large_as_near_ones():
-    kinds, far = np.arange(6), {}
-    placements = Placements.of(np.arange(6.0) * 20, 0.0)
-    for away in (0.0, 80.0):
-        herds = make_vehicles(np.random.default_rng(3), kinds, placements, 1, np.full(6, away))
-        far[away] = herds[0].local_m
-    assert far[80.0].shape[1] < 0.45 * far[0.0].shape[1]
-    for corner in (np.min, np.max):
-        near_m, far_m = (corner(m, axis=(1, 2)) for m in (far[0.0], far[80.0]))
-        assert np.allclose(near_m, far_m, atol=0.06)
+@pytest.mark.parametrize("kind", range(len(BODY_TYPES)))
+def test_vehicles_stand_on_their_tyres_and_have_their_size(kind):
+    body = BODY_TYPES[kind]
+    for variant in range(3):
+        shape = vehicle_shape(kind, variant)
+        assert shape is vehicle_shape(kind, variant)  # made once
+        assert 800 <= len(shape) <= 7000
+        low, high = shape.box_m
+        assert low[2] == pytest.approx(0, abs=1e-3)
+        size = (high - low) / np.array(body.size_m)
+        assert np.all((size > 0.75) & (size < (1.25, 1.4, 1.3)))  # with mirrors and plates
+        material = shape.material[shape.part]
+        tyres = shape.triangles_m[material == materials.RUBBER].reshape(-1, 3)
+        lowest = tyres[tyres[:, 2] < 0.02]
+        assert len(np.unique(np.sign(lowest[:, 0]) * 2 + np.sign(lowest[:, 1]))) == 4
+        glass = shape.triangles_m[material == materials.GLASS]
+        assert glass[..., 2].min() > 0.3 * high[2]
+        assert len(glass) > 60
+
+
+def test_objects_stretch_and_colour_their_shapes():
+    shape = vehicle_shape(0, 0)
+    placements = Placements.of(np.array([10.0, 30.0]), 2.0, np.array([0.0, 0.5]))
+    plan = sample_street_plan(np.random.default_rng(0), "city")
+    batch = make_vehicles(np.random.default_rng(3), np.array([0, 8]), placements, 5)
+    objects = batch.at(plan)
+    mesh, finish = objects.mesh(), objects.finish()
+    assert len(mesh) == len(finish) == sum(len(s) for s in objects.shapes)
+    assert set(np.unique(mesh.instance)) == {5, 6}
+    assert set(np.unique(mesh.label)) == {classes.CAR, classes.TRUCK}
+    paint = finish.albedo[(finish.instance == 5) & (finish.material == materials.PAINT)]
+    assert np.array_equal(np.unique(paint), np.unique(objects.albedo[0][[0]]))
+    first, frame = objects.shapes[0].triangles_m[100, 1].astype(float), objects.frame[0]
+    assert np.allclose(mesh.triangles_m[100, 1], frame[:3, :3] @ first + frame[:3, 3], atol=1e-4)
+    assert shape.box_m[1, 0] == pytest.approx(shape.triangles_m[..., 0].max())
 
 
 def test_what_moves_moves_and_the_rest_stays(scenes):

@@ -52,7 +52,7 @@ def ahead(*heights_m):
 
 
 def test_hits_agree_with_a_slow_loop():
-    mesh = street(leaves=40).mesh()
+    mesh = street(leaves=40).standing
     origins, directions = random_rays(200)
     hits = Tracer(mesh).cast(origins, directions)
     slow = [meet_slowly(mesh.triangles_m, o.astype(float), d.astype(float)) for o, d in zip(origins, directions)]  # noqa: B905
@@ -128,7 +128,7 @@ def test_planes_have_no_edges_and_boxes_have():
 
     def edge(*parts):
         scene = ToyScene(*parts)
-        first = Tracer(scene.mesh()).cast(*beams.rays(scene.sensor_pose()))
+        first = Tracer(scene.standing).cast(*beams.rays(scene.sensor_pose()))
         range_m = first.range_m.reshape(64, 1024)
         found = edges(range_m, np.roll(range_m, 1, 1), np.roll(range_m, -1, 1), MODEL.edge_share)
         return found, first.triangle.reshape(64, 1024), range_m

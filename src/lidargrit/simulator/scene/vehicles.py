@@ -103,7 +103,7 @@ def _running_gear(builder: ShapeBuilder, body: _Body) -> None:
     kind, radius = body.kind, body.kind.wheel_m
     wide = 0.115 if radius < 0.42 else 0.16  # half the width of a tyre
     tyre = lathe(radius * np.array([0.62, 0.7, 0.96, 1.0, 1.0, 0.96, 0.6]),
-                 wide * np.array([0.8, 1.0, 1.0, 0.7, -0.7, -1.0, -1.0]), sides=22)  # fmt: skip
+                 wide * np.array([0.8, 1.0, 1.0, 0.7, -0.7, -1.0, -1.0]), sides=24)  # fmt: skip
     rim = lathe(radius * np.array([0.0, 0.25, 0.45, 0.63]), wide * np.array([0.75, 0.85, 0.5, 0.8]), sides=14)
     turn = np.linspace(0, np.pi, 12)
     for axle in kind.axles:
