@@ -81,7 +81,7 @@ def detect_echoes(
     origins, directions, wide = rays[0][several], rays[1][several], edge[several]
     middle = Hits(first.range_m[several], first.triangle[several], first.cos_incidence[several])
     behind, light = tracer.cast_through(origins, directions, middle, passing)
-    light[behind.triangle == middle.triangle] = 0  # no pane was there, and no second echo
+    light[light == 1] = 0  # no pane was there, and no second echo
     corners = _corners(tracer, origins, directions, wide, model)
     parts = (middle, behind, *corners)
     powers = np.stack([_power(surfaces, part, model) for part in parts])

@@ -6,14 +6,14 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64, UInt8, UInt16
 
 from lidargrit.simulator.embree import EmbreeTriangles
 
 
 @dataclass(frozen=True, eq=False)
 class Finish:
-    """What triangles are made of.
+    """What triangles, or parts of objects, are made of.
 
     Args:
         material: index into ``MATERIALS``.
@@ -137,19 +137,23 @@ class Objects:
         shapes, albedo, label = (tuple(row[at] for at in some) for row in (self.shapes, self.albedo, self.label))
         return Objects(shapes, self.frame[some], albedo, label, self.instance[some])
 
+    def first_part(self) -> Int64[np.ndarray, " n"]:
+        """Return how many parts the objects before each have."""
+        return np.cumsum([0, *(len(shape.material) for shape in self.shapes)])[:-1]
+
     def finish(self) -> Finish:
-        """Return what their triangles are made of, object after object."""
+        """Return what their parts are made of, object after object."""
         if not self.shapes:
             return Mesh.of(np.zeros((0, 3, 3)), 0, 0.0, 0).finish()
-        each = [(shape.material[shape.part], albedo[shape.part], label[shape.part])
-                for shape, albedo, label in zip(self.shapes, self.albedo, self.label, strict=True)]  # fmt: skip
-        material, albedo, label = (np.concatenate(column) for column in zip(*each, strict=True))
-        return Finish(material, albedo, label, np.repeat(self.instance, [len(shape) for shape in self.shapes]))
+        material = [shape.material for shape in self.shapes]
+        instance = np.repeat(self.instance, [len(parts) for parts in material])
+        return Finish(*(np.concatenate(column) for column in (material, self.albedo, self.label)), instance)
 
     def mesh(self) -> Mesh:
         """Return all their triangles in the scene's frame, object after object."""
-        moved = [np.zeros((0, 3, 3), np.float32)]
-        for shape, frame in zip(self.shapes, self.frame, strict=True):
-            moved.append((shape.triangles_m @ frame[:3, :3].T + frame[:3, 3]).astype(np.float32))
-        finish = self.finish()
-        return Mesh(finish.material, finish.albedo, finish.label, finish.instance, np.concatenate(moved))
+        finish, moved, part = self.finish(), [np.zeros((0, 3, 3))], [np.zeros(0, np.int64)]
+        for shape, frame, first in zip(self.shapes, self.frame, self.first_part(), strict=True):
+            moved.append(shape.triangles_m @ frame[:3, :3].T + frame[:3, 3])
+            part.append(first + shape.part)
+        columns = (getattr(finish, field.name)[np.concatenate(part)] for field in fields(Finish))
+        return Mesh(*columns, np.concatenate(moved).astype(np.float32))

@@ -30,14 +30,16 @@ class Windows:
     origins_m: Float32[np.ndarray, "2 3"]
 
     @classmethod
-    def of(cls, objects: Objects, origins_m: Float32[np.ndarray, "r 3"]) -> "Windows":
+    def of(cls, objects: Objects, origins_m: Float32[np.ndarray, "2 3"]) -> "Windows":
         """Bound boxes as they are seen from the middle of all origins, and widen that by the farthest origin.
 
         A ray from an origin that lies aside by no more than a radius meets a box only if a parallel ray from the
         middle meets the box within that radius. So sensors that move during a revolution need nothing more.
+
+        Args:
+            origins_m: lowest and highest coordinates of the origins.
         """
-        origins = np.stack((origins_m.min(axis=0), origins_m.max(axis=0)))
-        low, high = origins.astype(np.float64)
+        low, high = origins_m.astype(np.float64)
         middle, aside_m = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + _SPARE_M
         box = np.stack([shape.box_m for shape in objects.shapes])  # (n, 2, 3)
         pick = np.array([(i >> 2 & 1, i >> 1 & 1, i & 1) for i in range(8)])
@@ -60,7 +62,11 @@ class Windows:
         slope[around] = -np.inf, np.inf
         upright = np.maximum(np.maximum(bottom, -top), 0)
         nearest = np.where(around, 0, np.hypot(np.maximum(apart, 0), upright))
-        return cls(nearest.astype(np.float32), azimuth, half, slope.astype(np.float32), origins)
+        return cls(nearest.astype(np.float32), azimuth, half, slope.astype(np.float32), origins_m)
+
+    def hold_for(self, origins_m: Float32[np.ndarray, "2 3"]) -> bool:
+        """Return whether origins between some bounds lie within those that were foreseen."""
+        return bool((origins_m[0] >= self.origins_m[0]).all() and (origins_m[1] <= self.origins_m[1]).all())
 
 
 def _gaps_m(

@@ -21,7 +21,8 @@ class Hits:
 
     Args:
         range_m: distance to the hit along the ray in metres, infinite where nothing is hit.
-        triangle: index of the triangle that is hit, or NOTHING.
+        triangle: index of the mesh's triangle that is hit, or NOTHING. The parts of kept objects follow the triangles,
+            object after object: an index of a part stands for all its triangles.
         cos_incidence: cosine between the ray and the triangle's normal, 0 to 1; 0 where nothing is hit.
     """
 
@@ -76,7 +77,7 @@ class Tracer:
     Args:
         mesh: triangles that rays can hit.
         reach_m: longest range at which a hit counts.
-        objects: kept objects; the indices of their triangles follow those of the mesh, object after object.
+        objects: kept objects.
     """
 
     def __init__(self, mesh: Mesh, reach_m: float = float("inf"), objects: Objects | None = None) -> None:
@@ -84,8 +85,7 @@ class Tracer:
         self._mesh = EmbreeTriangles(mesh.triangles_m)
         self._objects = objects or Objects.none()
         self._windows: Windows | None = None
-        counts = [len(mesh), *(len(shape) for shape in self._objects.shapes)]
-        self._first_triangle = np.cumsum(counts)[:-1].astype(np.int32)
+        self._first_part = (len(mesh) + self._objects.first_part()).tolist()
 
     def cast(
         self,
@@ -123,13 +123,9 @@ class Tracer:
 
     def _windows_from(self, origins_m: Float32[np.ndarray, "n 3"]) -> Windows:
         """Return the windows of a revolution's rays, which are those of its parts too."""
-        low, high = origins_m.min(axis=0), origins_m.max(axis=0)
-        if (
-            self._windows is None
-            or (low < self._windows.origins_m[0]).any()
-            or (high > self._windows.origins_m[1]).any()
-        ):
-            self._windows = Windows.of(self._objects, origins_m)
+        bounds = np.array([(axis.min(), axis.max()) for axis in origins_m.T]).T
+        if self._windows is None or not self._windows.hold_for(bounds):
+            self._windows = Windows.of(self._objects, bounds)
         return self._windows
 
     def _cast_at_objects(
@@ -145,12 +141,14 @@ class Tracer:
         """
         start_m, directions, beyond_m = cast
         range_m, triangle, normal = found
-        back = np.linalg.inv(self._objects.frame).astype(np.float32)
+        back = np.linalg.inv(self._objects.frame)[:, :3, :3].astype(np.float32)
+        into = back.swapaxes(1, 2).copy()  # of rows of vectors
         at_m = self._objects.frame[:, :3, 3].astype(np.float32)
+        nearest_m, slopes = windows.nearest_m.tolist(), windows.slope.tolist()
         objects, spans = rays.slices(windows)
         near_first = np.argsort(windows.nearest_m[objects], kind="stable")
         for which, (first, last) in zip(objects[near_first].tolist(), spans[near_first].tolist(), strict=True):
-            nearest, (low, high) = windows.nearest_m[which], windows.slope[which]
+            nearest, (low, high) = nearest_m[which], slopes[which]
             if nearest > self._reach_m:
                 break
             slope = rays.slope[first:last]
@@ -158,15 +156,16 @@ class Tracer:
             if len(ray) == 0:
                 continue
             ray += first
-            turn = back[which, :3, :3]
-            start, direction = (start_m[ray] - at_m[which]) @ turn.T, directions[ray] @ turn.T
-            kept, begun_m = self._objects.shapes[which].kept, beyond_m[ray]
-            further_m, met, facing = kept.cast(start, direction, range_m[ray] - begun_m)
+            start, direction = (start_m[ray] - at_m[which]) @ into[which], directions[ray] @ into[which]
+            shape, begun_m = self._objects.shapes[which], beyond_m[ray]
+            further_m, met, facing = shape.kept.cast(start, direction, range_m[ray] - begun_m)
             nearer = (met >= 0).nonzero()[0]
+            if len(nearer) == 0:
+                continue
             ray = ray[nearer]
-            range_m[ray] = (further_m + begun_m)[nearer]
-            triangle[ray] = met[nearer] + self._first_triangle[which]
-            normal[ray] = facing[nearer] @ turn  # normals turn by the inverse's transpose
+            range_m[ray] = further_m[nearer] + begun_m[nearer]
+            triangle[ray] = shape.part[met[nearer]].astype(np.int32) + self._first_part[which]
+            normal[ray] = facing[nearer] @ back[which]  # normals turn by the inverse's transpose
 
     def cast_through(
         self,

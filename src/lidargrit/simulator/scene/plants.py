@@ -16,7 +16,7 @@ TREES, BUSHES, HEDGES = 30, 20, 6  # shapes of each
 _TRUNK, _LIMBS, _LEAVES = range(3)
 _MATERIALS = (materials.BARK, materials.BARK, materials.LEAVES)
 _LABELS = (classes.TRUNK, classes.VEGETATION, classes.VEGETATION)
-_HEDGE_M = np.array([2.6, 0.9, 1.4])  # of the shapes: pieces that overlap a little
+_HEDGE_M = np.array([5.0, 0.9, 1.4])  # of the shapes: pieces that overlap a little
 # Height, its part below the crown, half the width of the crown, leaves; a round, a high, a slim, a small one, a fir.
 _HABITS = ((9.5, 0.30, 3.2, 3400), (12.0, 0.28, 3.0, 3800), (13.0, 0.10, 1.4, 3000), (5.5, 0.36, 1.7, 2200),
            (11.0, 0.06, 2.3, 3600))  # fmt: skip
@@ -102,7 +102,7 @@ def hedge_shape(variant: int) -> Shape:
     rng, builder = np.random.default_rng((76, variant)), ShapeBuilder(*_MATERIALS)
     half = _HEDGE_M * np.array([0.5, 0.5, 1.0])
     builder.add(_LEAVES, boxes(np.array([-half[0], -half[1] + 0.13, -0.3]), half - np.array([0.0, 0.13, 0.13])))
-    number = 1500
+    number = 2600
     point = rng.uniform(-1, 1, (number, 3))
     face = rng.choice(3, number, p=[0.32, 0.32, 0.36])
     point[face == 0, 1], point[face == 1, 1], point[face == 2, 2] = -1, 1, 1
@@ -168,7 +168,7 @@ def make_hedges(
 ) -> ObjectBatch:
     """Make cut hedges that fill boxes of the street, each as several pieces along it."""
     length = u_m[:, 1] - u_m[:, 0]
-    pieces = np.maximum(np.ceil(length / 2.6), 1).astype(int)
+    pieces = np.maximum(np.ceil(length / 5.5), 1).astype(int)
     home = np.repeat(np.arange(len(length)), pieces)
     order = np.arange(len(home)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     step = (length / pieces)[home]
