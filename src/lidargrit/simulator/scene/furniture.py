@@ -172,7 +172,7 @@ def make_furniture(
     """Make things of given kinds and variants at places, each of a colour of its own."""
     count = len(kinds)
     shapes = [furniture_shape(int(kind), int(variant)) for kind, variant in zip(kinds, variants, strict=True)]
-    albedo = np.column_stack((rng.uniform(0.15, 0.4, count), np.full(count, 0.5), np.full(count, 0.3),
+    albedo = np.column_stack((rng.uniform(0.08, 0.3, count), np.full(count, 0.5), np.full(count, 0.3),
                               rng.uniform(0.04, 0.5, count), rng.uniform(0.2, 0.4, count),
                               rng.uniform(0.3, 0.6, count), np.full(count, 0.02)))  # fmt: skip
     return ObjectBatch.standing(shapes, np.ones((count, 3)), albedo, _LABELS, placements)

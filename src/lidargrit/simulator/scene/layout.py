@@ -17,7 +17,7 @@ _PARKED_SHARE = {"city": (0.25, 0.85), "suburb": (0.1, 0.65), "country": (0.0, 0
 _TRAFFIC = {"city": 3.0, "suburb": 1.2, "country": 1.5}
 _WALKERS = {"city": 5.0, "suburb": 1.0, "country": 0.15}
 _CYCLISTS = {"city": 0.8, "suburb": 0.35, "country": 0.15}
-_ABOUT = {"city": 7.0, "suburb": 3.5, "country": 0.0}  # things that stand about on each pavement
+_ABOUT = {"city": 12.0, "suburb": 5.0, "country": 0.0}  # things that stand about on each pavement
 _ABOUT_SHARES = {
     furniture.BIN: 0.3, furniture.CABINET: 0.16, furniture.BENCH: 0.08, furniture.PLANTER: 0.16,
     furniture.COLUMN: 0.03, furniture.SHELTER: 0.05, furniture.METER: 0.1, furniture.SIGNAL: 0.06,
@@ -31,14 +31,15 @@ def add_gardens(
 ) -> list[ObjectBatch]:
     """Line front gardens with walls and fences, and close some gaps; return the hedges."""
     lines: dict[str, list[tuple[float, float, float, float]]] = {"hedge": [], "wall": [], "fence": []}
-    taste = rng.dirichlet([3.0, 1.3, 0.9])  # each street has its own
+    taste = rng.dirichlet([3.0, 1.3, 0.5])  # each street has its own
+    lined = rng.uniform(0.1, 0.8)  # and its own share of front gardens without a boundary
     for which, side in enumerate((-1, 1)):
         edge = plan.edge_m[which] + plan.pavement_m[which] + 0.15
         for low, high in free_spans(plan, side) if plan.setback_m[which] > 1.3 and plan.theme != "country" else []:
             along = max(low, -_BOUNDARY_TO_M)
             while along < min(high, _BOUNDARY_TO_M):
                 length = min(rng.uniform(4, 15), high - along)
-                if rng.random() < 0.8 and length > 1:
+                if rng.random() < lined and length > 1:
                     lines[str(rng.choice(list(lines), p=taste))].append((along, along + length, side * edge, side))
                 along += length + rng.uniform(0.8, 3.6)
     for u_from, u_to, side in town.gaps_m[np.abs(town.gaps_m[:, :2]).min(axis=1) < _BOUNDARY_TO_M]:
@@ -83,13 +84,13 @@ def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> li
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
     lots = [*_parks(rng, town), *(_woods(rng) if plan.theme == "country" else [])]
-    count = rng.poisson({"city": 45, "suburb": 75, "country": 40}[plan.theme] * green)
-    lots.append(np.column_stack((rng.normal(0, 50, count), rng.normal(0, 34, count))))
+    count = rng.poisson({"city": 65, "suburb": 110, "country": 40}[plan.theme] * green)
+    lots.append(np.column_stack((rng.normal(0, 55, count), rng.normal(0, 45, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
-    wood = make_trees(rng, plan, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
-    count = rng.poisson({"city": 60, "suburb": 230, "country": 50}[plan.theme] * green)
-    points = [np.column_stack((rng.normal(0, 30, count), rng.normal(0, 13, count))), *_parks(rng, town)]
+    wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
+    count = rng.poisson({"city": 30, "suburb": 110, "country": 40}[plan.theme] * green)
+    points = [np.column_stack((rng.normal(0, 35, count), rng.normal(0, 18, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
     return [*wood, make_bushes(rng, u, v, plan.level_m[1])]
 
@@ -132,7 +133,7 @@ def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
     rows = []
     for which, side in enumerate((-1, 1)):
         wide = plan.theme == "country" or plan.pavement_m[which] > 1.8
-        if not wide or rng.random() > {"city": 0.35, "suburb": 0.25, "country": 0.4}[plan.theme]:
+        if not wide or rng.random() > {"city": 0.45, "suburb": 0.35, "country": 0.4}[plan.theme]:
             continue
         row = np.arange(-90.0, 90.0, rng.uniform(7, 16)) + rng.uniform(-3, 3)
         away = plan.edge_m[which] + (0.9 if plan.theme != "country" else rng.uniform(2.0, 5.0))

@@ -41,7 +41,7 @@ def tree_shapes(variant: int) -> tuple[Shape, Shape]:
     habit = variant % len(_HABITS)
     tall, bare, wide, number = np.array(_HABITS[habit]) * rng.uniform(0.85, 1.15, 4)
     foot = bare * tall
-    thick = tall * rng.uniform(0.012, 0.02)
+    thick = tall * rng.uniform(0.009, 0.016)
     share = np.linspace(0, 1, 7)
     bend = np.cumsum(rng.normal(0, 0.03, (7, 2)), axis=0) * share[:, None]
     high = 0.95 if habit in (2, _FIR) else 0.62
