@@ -19,8 +19,8 @@ from lidargrit.simulator.scene.street_plan import StreetPlan, Theme, sample_stre
 __all__ = ["Scene", "Theme", "sample_scene"]
 
 SENSOR_HEIGHT_M = 1.73  # of the Velodyne above the road, Geiger et al., IJRR 2013, figure 3
-# Yaw, pitch and roll of the sensor to the road: no sensor is mounted level, and a road falls to its sides. Planes fitted
-# to the roads of five real drives: pitch -0.4 to -0.8 degrees and once 1.5, roll -1.8 to 0.2, spread within a drive 0.8.
+# Yaw, pitch and roll of the sensor to the road: no sensor is mounted level, and a road falls to its sides.
+# Planes fitted to the roads of five real drives: pitch -.4 to -.8 degrees, once 1.5; roll -1.8 to .2.
 _ATTITUDE_RAD, _ATTITUDE_SPREAD_RAD = (0.0, -0.012, 0.0), (0.015, 0.016, 0.024)
 
 
