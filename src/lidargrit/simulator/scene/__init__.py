@@ -52,8 +52,12 @@ class Scene:
             objects.add_to(builder, self.plan, time_s)
         return Mesh.join([self.standing, builder.build()]) if len(builder) else self.standing
 
-    def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
-        """Return the transform from the sensor's frame to the world at a time; our car keeps to its lane."""
+    def sensor_pose(self, time_s: float = 0.0, height_m: float = SENSOR_HEIGHT_M) -> Float64[np.ndarray, "4 4"]:
+        """Return the transform from the sensor's frame to the world at a time; our car keeps to its lane.
+
+        Args:
+            height_m: height of the sensor above the road.
+        """
         here = self.plan.poses(np.array([self.speed_m_s * time_s]), np.array([self.plan.our_v_m]))
         yaw, pitch, roll = self.attitude_rad
         ahead, slope = float(here.yaw_rad[0]) + yaw, here.slope[0]
@@ -67,7 +71,7 @@ class Scene:
         up = np.cross(forward, left)
         pose = np.eye(4)
         pose[:3, :3] = np.stack((forward, left, up), axis=1)
-        pose[:3, 3] = here.xyz_m[0] + SENSOR_HEIGHT_M * up
+        pose[:3, 3] = here.xyz_m[0] + height_m * up
         return pose
 
 
