@@ -31,7 +31,8 @@ from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import sample_scene
 from lidargrit.simulator.tracing import Hits, Tracer, in_reach
 
-FITTED = [name for name in CURVES if name not in ("range_histogram_per_ring", "bev_occupancy")]  # those are geometry
+_GEOMETRY = ("range_histogram_per_ring", "bev_occupancy", "wall_straightness", "point_cloud_jsd")
+FITTED = [name for name in CURVES if name not in _GEOMETRY]
 # First step: the factor by which a parameter, or one of a material, is multiplied or divided, or what is added to it.
 FACTORS = {
     "near_m": 1.5,

@@ -247,8 +247,6 @@ def test_the_cost_of_a_pass_at_the_small_size_is_that_counted_in_the_program():
     "settings",
     [
         {"channels": 1},
-        {"log2_scale": 0.0},
-        {"log2_scale": float("nan")},
         {"sigma_largest": 0.001},
         {"sigma_smallest": 0.0},
         {"levels": 1},

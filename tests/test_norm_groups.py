@@ -5,9 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lidargrit.core.errors import ConfigError
 from lidargrit.generation.presets import load_preset
-from lidargrit.generation.tokenizers import make_tokenizer
 from lidargrit.systems.lidm.latent_unet import LatentUnet
 
 
@@ -28,19 +26,3 @@ def test_a_small_denoiser_sees_latents_that_are_too_high_as_a_whole(preset):
 
     groups = load_preset(preset).model.denoiser.norm_groups
     assert moved(groups) > 5 * moved(32)
-
-
-def test_all_norms_of_a_tokenizer_have_as_many_groups_as_its_setting_says():
-    loaded = load_preset("lidm_small")
-    plain, coarser = (
-        make_tokenizer(replace(loaded.model.tokenizer, norm_groups=groups), loaded.data.load_sensor())
-        for groups in (32, 8)
-    )
-    norms = [module for module in coarser.modules() if isinstance(module, torch.nn.GroupNorm)]
-    assert {norm.num_groups for norm in norms} == {8}
-    assert len(norms) > 10
-    shapes = [{name: weight.shape for name, weight in each.state_dict().items()} for each in (plain, coarser)]
-    assert shapes[0] == shapes[1]
-    for groups in (0, 24):
-        with pytest.raises(ConfigError, match=f"{groups}"):
-            replace(loaded.model.tokenizer, norm_groups=groups)

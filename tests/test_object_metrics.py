@@ -153,7 +153,9 @@ def test_a_box_is_as_long_above_as_below_and_a_car_is_not():
 def test_scans_without_labels_and_rays_without_a_segmenter_are_told_with_a_cure():
     images = streets(*GENERATED)[:2]
     bare = RangeImage(images.range_m, images.return_mask, SENSOR)
-    with pytest.raises(DataError, match=r"^got range images without labels; wanted labels in both sets; use the var"):
+    with pytest.raises(
+        DataError, match=r"^got range images without labels; wanted labels in both sets; --variant segmented$"
+    ):
         score("class_jsd", bare, images)
     few = SENSOR.with_columns(64)
     other = RangeImage(torch.ones(1, 64, 64), torch.ones(1, 64, 64, dtype=torch.bool), few)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.scans.example import Example
@@ -130,3 +131,17 @@ def test_scans_of_which_no_level_is_sampled_are_the_true_ones_and_others_keep_th
 def test_sizes_that_the_levels_cannot_halve_are_refused():
     with pytest.raises(ConfigError, match="for 7 levels"):
         Pyramid(replace(Pyramid.smallest_config(SENSOR), levels=7), SENSOR)
+
+
+def test_coarser_levels_have_a_temperature_of_their_own_and_follow_the_one_that_is_asked_for():
+    smallest = pyramid().config
+    config = replace(smallest, pixels=replace(smallest.pixels, range_temperature=0.7), coarse_range_temperature=0.2)
+    asked = PixelSampling(range_temperature=0.7)
+
+    def sampled_m(coarse_temperature, sampling=None):
+        torch.manual_seed(0)
+        model = Pyramid(replace(config, coarse_range_temperature=coarse_temperature), SENSOR)
+        return model.sample([5], sampling=sampling).range_m
+
+    torch.testing.assert_close(sampled_m(0.7), sampled_m(0.2, asked), rtol=0, atol=0)
+    assert not torch.equal(sampled_m(0.2), sampled_m(0.2, asked))

@@ -145,18 +145,32 @@ def test_only_views_from_above_are_plotted_as_maps(rows, tmp_path, monkeypatch):
     assert len(labels) == 3
 
 
+def _distance(name, *sources):
+    metric = load_metric(name)()
+    for source, real in zip(sources, (False, True), strict=True):
+        metric.update(load_range_images((source,), DataConfig()).batch([0, 1]), real=real)
+    return metric.compute().value
+
+
 def test_the_verb(tmp_path, capsys, monkeypatch):
     picture, file = tmp_path / "curves.png", tmp_path / "curves.json"
     torch.manual_seed(0)
     LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR).save(tmp_path / "run")
     words = ["evaluate", "simulated:2", "simulated:2:val", "--protocol", "streets"]
     report = ["--report", str(picture), "--json", str(file), "--model", str(tmp_path / "run")]
+    report += ["--beside", "simulated:2:test"]
     words, few = [*words, *report], words
     assert main(words) == 0
-    assert "drop_run_lengths" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "drop_run_lengths" in out
+    assert out.count("another real") == 2
+    assert "building, median range [m]" in out
     found = json.loads(file.read_text())
     assert (found["samples"], found["reference"]) == ("simulated:2", "simulated:2:val")
-    assert {"simulated", "bernoulli", "real_against_real", "ratio"} == set(found["curves"][0])
+    assert {"simulated", "bernoulli", "real_against_real", "another_real", "ratio"} == set(found["curves"][0])
+    assert set(found["figures"]) == {"simulated", "real", "another_real"}
+    alone = [metric for metric in found["curves"] if metric["another_real"]["metric"] == "wall_straightness"]
+    assert alone[0]["another_real"]["value"] == _distance("wall_straightness", "simulated:2:test", "simulated:2:val")
     kinds = ["simulated"] * 5 + ["real"] * 5 + ["real_triangulated"] * 5
     assert [score["scans"] for score in found["raydrop"]] == kinds
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -171,6 +185,8 @@ def test_the_verb(tmp_path, capsys, monkeypatch):
         (["evaluate", "simulated:2@vlp16", *few[2:]], "got streets of 'vlp16' and scans of 'hdl64e_kitti_odometry'"),
         ([*few, "--pixel-statistics"], "got --pixel-statistics with --protocol streets"),
         (["evaluate", "simulated:2", "simulated:2:val", "--model", "pretrained"], "got --model without --tables"),
+        ([*few[:3], "--beside", "simulated:2"], "got --beside without --tables"),
+        ([*few, "--beside", "nowhere"], "got nowhere, which"),
         ([*few, "--report", str(tmp_path / "curves.html")], "curves.html, which will hold"),
     ):
         assert main(wrong) == 2

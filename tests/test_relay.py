@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
 import pytest
 import torch
 
@@ -30,6 +31,7 @@ sys.path.insert(0, str(ROOT / "benchmarks" / "relay"))
 
 from leg import Leg, run_leg  # noqa: E402
 from packing import MANIFEST, RELAY_FILE, pack, unpack  # noqa: E402
+from streets import Streets  # noqa: E402
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32, 1)
 IMAGES = RangeImages(SENSOR, [SeededImages(SENSOR, 8)])
@@ -198,3 +200,12 @@ def test_what_travels_leaves_room_for_the_state(tmp_path):
     wheels = sum(path.stat().st_size for path in (tmp_path / "wheels").glob("*.whl"))
     assert wheels > MIB
     assert tree + wheels < 54 * MIB, json.dumps({"tree": tree, "wheels": wheels})
+
+
+def test_streets_that_nobody_has_read_yet_are_not_simulated_again(tmp_path):
+    streets = Streets(tmp_path)
+    assert streets.next_seed(8) == 8
+    np.save(tmp_path / "0000000_0000007.npy", np.zeros((1, 4, 8), np.uint16))
+    assert streets.count == 1
+    np.save(tmp_path / "0000008_0000015.npy", np.zeros((1, 4, 8), np.uint16))
+    assert streets.next_seed(8) == 16

@@ -54,7 +54,8 @@ def test_every_kind_is_told_from_its_name(folders):
     assert type(open_source("pretrained")) is RunSource
     prepared = open_source(str(folders / "test"))
     assert (prepared.data_set, prepared.split) == ("simulated", "test")
-    assert prepared.projection_variant(DataConfig(projection_variant="reference")) == "exact", "as they were prepared"
+    as_projected = prepared.as_projected(DataConfig(projection_variant="reference"))
+    assert as_projected.projection_variant == "exact", "as they were prepared"
     samples = open_source(str(folders / "samples"))
     assert (samples.data_set, len(samples.images())) == ("samples", 2)
     assert samples.sensor.same_rays(open_source(str(folders / "run")).sensor)

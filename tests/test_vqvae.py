@@ -1,7 +1,6 @@
 """The VQ-VAE against the reference program, its parameter counts, its losses, its circle."""
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss, upright_and_thin
+from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig, reconstruction_loss
 from lidargrit.nn.convolution import FoldedUpsample, Upsample
 from lidargrit.scans.example import Example
 from lidargrit.scans.projection import RangeEncoding
@@ -246,33 +245,6 @@ def test_sizes_that_cannot_be_halved_are_refused():
 def test_negative_weights_of_the_loss_are_refused(name, wrong):
     with pytest.raises(ConfigError, match=f"{name}={wrong}; wanted a number, at least 0"):
         VqvaeConfig(**{name: wrong})
-
-
-def test_thin_upright_things_are_found_by_a_slow_loop_and_weigh_more():
-    rng = torch.Generator().manual_seed(0)
-    range_m = 5 + 15 * torch.rand((2, 12, 16), generator=rng).round(decimals=1)
-    range_m[:, :, 5] = 4.0  # a pole before whatever is behind it
-    mask = torch.rand((2, 12, 16), generator=rng) < 0.9
-    slow = torch.zeros(2, 12, 16)
-    for b, i, j in torch.cartesian_prod(torch.arange(2), torch.arange(12), torch.arange(16)).tolist():
-
-        def same(row, column, b=b, i=i, j=j):
-            if not (0 <= row < 12 and mask[b, row, column] and mask[b, i, j]):
-                return 0.0
-            return float(abs(math.log(range_m[b, row, column] / range_m[b, i, j])) < 0.05)
-
-        upright = sum(same(i + shift, j) for shift in range(-4, 5) if shift) / 8
-        flat = sum(same(i, (j + shift) % 16) for shift in range(-3, 4) if shift) / 6
-        slow[b, i, j] = upright * (1 - flat) * float(mask[b, i, j])
-    found = upright_and_thin(range_m, mask)
-    assert torch.allclose(found, slow, atol=1e-6)
-    assert float(found[:, :, 5].mean()) > 2 * float(found.mean())
-
-    encoded, target = torch.zeros(2, 12, 16), torch.rand((2, 12, 16), generator=rng)
-    weights = 1 + 8 * found
-    wanted = sum(float((target[b] * weights[b] * mask[b]).sum() / (weights[b] * mask[b]).sum()) for b in range(2))
-    ours = reconstruction_loss(encoded, target, mask, mask, "returns", weights)
-    assert float(ours) == pytest.approx(wanted / 2, rel=1e-5)
 
 
 def test_cells_may_have_fewer_columns_than_rows():

@@ -11,7 +11,7 @@ from lidargrit.core.errors import CheckpointError
 from lidargrit.core.files import write_json
 from lidargrit.core.table import render
 from lidargrit.data.images import Provenance
-from lidargrit.data.sources.samples import MANIFEST, full_rows_of
+from lidargrit.data.sources.samples import MANIFEST, read_facts
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
@@ -49,15 +49,15 @@ def compared(sets):
 
 
 def test_samples_tell_which_rows_are_full(sets):
-    assert full_rows_of(sets / "lidargan") == range(40, 64)
-    assert full_rows_of(sets / "dusty") is None
+    assert read_facts(sets / "lidargan").full_rows == range(40, 64)
+    assert read_facts(sets / "dusty").full_rows is None
 
 
 def test_a_manifest_with_other_rows_is_refused(sets, tmp_path):
     manifest = json.loads((sets / "lidargan" / MANIFEST).read_text())
     write_json(tmp_path / MANIFEST, {**manifest, "full_rows": "all"})
     with pytest.raises(CheckpointError, match="whose full_rows are no two rows"):
-        full_rows_of(tmp_path)
+        read_facts(tmp_path)
 
 
 def test_the_scorecard_says_so_in_words(compared, tmp_path):

@@ -91,9 +91,8 @@ class Streets:
         return len(self._images)
 
     def next_seed(self, first_seed: int) -> int:
-        """Return the seed after the last of the streets that are there; ``first_seed`` if there is none."""
-        self._look()
-        return max((int(name[8:15]) + 1 for name in self._files), default=first_seed)
+        """Return the seed after the last of the streets in the folder, read or not; ``first_seed`` if there is none."""
+        return max((int(path.name[8:15]) + 1 for path in self._folder.glob("*.npy")), default=first_seed)
 
     def read(self, index: int) -> Pixels:
         """Return the street of an index, modulo those that are there; wait for the first one."""

@@ -36,8 +36,8 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
         card, pair = compare_sources(*sets, config)
         report = partial(write_report, card, pair, options.report) if options.report else None
         return card.as_table(), card.to_json(), report
-    refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model"))
+    refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model", "beside"))
     refuse_to_overwrite(options.report, options.overwrite, ".png")
-    text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model)
+    text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model, options.beside)
     plot = partial(plot_curves, curves, options.report, f"real: {options.reference}") if options.report else None
     return text, values, plot

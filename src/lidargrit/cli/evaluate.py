@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(parser)
     add_scans(parser)
     add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
+    add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
     add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
     add_json(parser, "the files of --json and --report")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")

@@ -25,8 +25,10 @@ from lidargrit.core.files import (
 from lidargrit.core.reporting import Progress
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
+from lidargrit.data.datasets.folder import SENSOR_FILE
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
 TREE = "kitti_odometry"  # the data set that reads such a tree back
@@ -115,6 +117,11 @@ class ScanFolder:
         if not self._told_labels:
             reporting.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
             self._told_labels = True
+
+    def tell_sensor(self, sensor: SensorModel) -> None:
+        """Write beside the scans, unless it is there, on which rays their points lie."""
+        if not (path := self.out / SENSOR_FILE).exists():
+            write_json(path, sensor.to_json())
 
     def _claim(self) -> None:
         """Write the manifest, or add to the one that is there."""

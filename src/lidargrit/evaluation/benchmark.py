@@ -22,7 +22,7 @@ from lidargrit.core.processes import check_processes, process_pool
 from lidargrit.core.table import Format, render
 from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
-from lidargrit.data.sources import SampleSource, Source, TensorSource, data_set_of, open_source
+from lidargrit.data.sources import Source, data_set_of, open_source
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.costs import COSTS, Costs, costs_table, read_costs
@@ -212,10 +212,10 @@ def _score_samples(samples: Source, folder: Path, benchmark: Benchmark, referenc
     """Score samples that are there, of which neither the costs nor the training are known."""
     settings = benchmark.evaluation()
     pair = open_pair(samples, reference, settings)
-    if isinstance(samples, SampleSource):
+    if samples.folder is not None:
         pair = _of_first_seeds(pair, samples.folder)
     folder.mkdir(parents=True, exist_ok=True)
-    Costs(folder / COSTS, samples.weights_sha256()).write_unknown()
+    Costs(folder / COSTS, samples.weights_sha256).write_unknown()
     _score(pair, settings, folder / f"{folder.name}.json")
     _warn_of_limits(pair, benchmark)
 
@@ -313,7 +313,7 @@ class _Plan:
             generator = load(run)
             return cls(system, run, None, generator.parse_sampling(settings), generator.sensor)
         held = open_source(name) if run.is_dir() and not is_preset(name) else None
-        if isinstance(held, (SampleSource, TensorSource)):
+        if held is not None and held.is_generated:
             if settings:
                 got = f"{system}, settings of sampling for samples that are there"
                 raise ConfigError(got, "a folder of samples alone", "leave the settings out")

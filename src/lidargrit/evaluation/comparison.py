@@ -12,7 +12,7 @@ from lidargrit.core.errors import ConfigError, LidarGritError, nearest_names, on
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
-from lidargrit.data.sources import RunSource, SampleSource, Source, TensorSource, open_source
+from lidargrit.data.sources import RunSource, Source, open_source
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
@@ -314,7 +314,7 @@ def _doubts(scores: Sequence[Score], settings: EvalConfig) -> list[str]:
 
 def _refuse_unused(samples: Source, config: EvalConfig) -> None:
     """Refuse a sensor or columns for generated images, which keep their own, and weights that no metric needs."""
-    if isinstance(samples, (SampleSource, TensorSource)):
+    if samples.is_generated:
         columns, stride, default = config.data.columns, config.data.column_stride, DataConfig()
         held = f"for {samples.text}, which holds {samples.kind}"
         if config.sensor:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,7 +16,7 @@ from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
-from lidargrit.data.sources import DatasetSource, RunSource, open_source, overlap
+from lidargrit.data.sources import RunSource, open_source, overlap
 from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
@@ -162,13 +162,12 @@ def measure_source(
         tokens.
     """
     run = RunSource(model, locate(model))
-    variant = run.projection_variant(config) or config.projection_variant
-    config = replace(config, projection_variant=variant)
-    generator = load(run.folder).to(usable_device(device))
+    config = run.as_projected(config)
+    generator = load(locate(model)).to(usable_device(device))
     has_tokens = "tokens" in generator.capabilities
     source = open_source(text, config.bad_points)
     images = source.images(run.sensor, config)
-    if isinstance(source, DatasetSource):
+    if source.has_points:
         with suppress(ScanError):  # of a first scan that was left out, and told of
             reporting.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))
     if shared := overlap(run, None, images):
@@ -176,7 +175,7 @@ def measure_source(
             f"WARNING: {run.text} has learned from some of these scans ({shared}): the figures flatter it"
         )
     tables: list[Table] = []
-    values: dict[str, Any] = {"model": model, "source": text, "projection_variant": variant}
+    values: dict[str, Any] = {"model": model, "source": text, "projection_variant": config.projection_variant}
     if "likelihood" in generator.capabilities or maps is not None or not has_tokens:  # else refused, with what it lacks
         found = score_likelihood(generator, images, step_mm, maps)
         tables, values = [found.table()], {**values, **found.as_json()}

@@ -9,8 +9,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import DatasetSource, SampleSource, Source, overlap
-from lidargrit.data.sources.samples import full_rows_of
+from lidargrit.data.sources import Source, overlap
 from lidargrit.evaluation.protocols import Protocol
 from lidargrit.evaluation.scorecard import EvalSetRecord
 from lidargrit.scans.sensors import SensorModel
@@ -131,10 +130,10 @@ def pair_for_protocol(
     sensor = sensor or protocol.load_sensor()
     config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))
     first = _Opened.of(samples, sensor, config)
-    if isinstance(samples, DatasetSource):  # whose points may have had to go by elevation: then so do the reference's
+    if samples.has_points:  # whose points may have had to go by elevation: then so do the reference's
         config = replace(config, projection_variant=first.projection_variant)
     second = _Opened.of(reference, first.images.sensor, config)
-    if isinstance(samples, DatasetSource) and second.images.sensor.projection != first.images.sensor.projection:
+    if samples.has_points and second.images.sensor.projection != first.images.sensor.projection:
         config = replace(config, projection_variant=second.projection_variant)
         first = _Opened.of(samples, second.images.sensor, config)
     require_same_rays(first.images.sensor, second.images.sensor)
@@ -161,7 +160,7 @@ class _Opened:
     @classmethod
     def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig) -> "_Opened":
         images = source.images(sensor, config)
-        return cls(source, images, source.projection_variant(config), source.doubts)
+        return cls(source, images, source.projection_variant, source.doubts)
 
     def as_set(self, count: int, range_m: tuple[float, float] | None) -> EvalSet:
         """Return so many of the images, evenly spaced, as one set of an evaluation."""
@@ -174,8 +173,8 @@ class _Opened:
             source.data_set,
             source.split,
             self.projection_variant,
-            source.weights_sha256(),
-            full_rows_of(source.folder) if isinstance(source, SampleSource) else None,
+            source.weights_sha256,
+            source.full_rows,
         )
 
 

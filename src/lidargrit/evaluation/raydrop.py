@@ -9,10 +9,11 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.table import render
 from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
-from lidargrit.data.sources import DatasetSource, open_source
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.protocols import public_name
-from lidargrit.evaluation.realism import CurveScore, SimulatedScans, compare, scans_of_both, score_curves, tables
+from lidargrit.evaluation.realism import CurveScore, SimulatedScans, StreetScans, compare, score_curves, tables
+from lidargrit.evaluation.street_figures import figures_table
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import Observed
@@ -34,30 +35,36 @@ def streets_of(samples: str, config: EvalConfig) -> Streets | None:
     if public_name(config.protocol) != "streets" or not samples.startswith("simulated"):
         return None
     source = open_source(samples, config.data.bad_points)
-    streets = source.scans() if isinstance(source, DatasetSource) else None
+    streets = source.scans() if source.has_points else None
     return streets if isinstance(streets, Streets) else None
 
 
 def evaluate_streets(
-    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str
+    samples: str, streets: Streets, reference: str, config: EvalConfig, model: str = "", beside: str = ""
 ) -> tuple[str, dict[str, Any], list[CurveScore]]:
     """Compare simulated streets, and independent drops of their clean scans, with real scans.
 
     Args:
         model: run that drops returns of clean scans, which is compared too; none if empty.
+        beside: source of scans of another real drive, which are compared too; none if empty.
 
     Returns:
         tables, their plain values, and the curves, which can be plotted.
     """
     drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
-    simulated, real = scans_of_both(
-        streets, open_source(reference, config.data.bad_points), config.sensor, config.data_config()
-    )
+    source, other = (open_source(word, config.data.bad_points) if word else None for word in (reference, beside))
+    assert source is not None
+    scans = StreetScans.of(streets, source, config.sensor, config.data_config())
+    real, another = scans.real(), other.images(scans.rays, scans.config) if other else None
+    simulated = scans.simulated()
     of_model = scores_of_model(drops, simulated, real) if drops else []
-    scores = compare(simulated, real)
+    scores = compare(simulated, real, beside=another)
+    figures = scans.figures(other)
     about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
+    about |= {"beside": beside} if beside else {}
     found = {"curves": [each.to_json() for each in scores], "raydrop": [each.to_json() for each in of_model]}
-    return render(tables([*scores, *of_model])), {**about, **found}, scores
+    found |= {"figures": {name.replace(" ", "_"): each.to_json() for name, each in figures.items()}}
+    return render([*tables([*scores, *of_model]), figures_table(figures)]), {**about, **found}, scores
 
 
 def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: RangeImage) -> list[CurveScore]:

@@ -16,6 +16,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.source import Source
 from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.street_figures import StreetFigures
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import MetricResult, RangeImage
@@ -30,8 +31,11 @@ CURVES = (
     "drop_correlation",
     "reflectance_histogram",
     "bev_occupancy",
+    "wall_straightness",
+    "flying_points",
+    "point_cloud_jsd",
 )
-"""The metrics that are compared, each a Jensen-Shannon distance."""
+"""The metrics that are compared: Jensen-Shannon distances, the last a divergence."""
 
 _BATCH = 16
 
@@ -57,6 +61,7 @@ class CurveScore:
         own: distance of the simulated scans, or of those whose returns a model drops; they are the generated set of it.
         bernoulli: distance of clean scans from which returns are dropped with one constant probability.
         real_against_real: distance between the two halves of the true scans, which shows how much true scans differ.
+        beside: distance of scans of another real drive, which no simulator has to beat; None if none is given.
         scans: kind of the scans whose returns a model drops: ``simulated``; ``real``, with ranges that a tokenizer
             decodes; or ``real_triangulated``, with ranges interpolated from other rays' returns. "" for no model.
     """
@@ -64,6 +69,7 @@ class CurveScore:
     own: MetricResult
     bernoulli: MetricResult
     real_against_real: MetricResult
+    beside: MetricResult | None = None
     scans: str = ""
 
     @property
@@ -74,26 +80,38 @@ class CurveScore:
     def to_json(self) -> dict[str, Any]:
         """Return the distances with their curves."""
         whose = {"scans": self.scans, "model": asdict(self.own)} if self.scans else {"simulated": asdict(self.own)}
-        beside = {"bernoulli": asdict(self.bernoulli), "real_against_real": asdict(self.real_against_real)}
-        return {**whose, **beside, "ratio": self.ratio}
+        rows = {"bernoulli": asdict(self.bernoulli), "real_against_real": asdict(self.real_against_real)}
+        another = {"another_real": asdict(self.beside)} if self.beside else {}
+        return {**whose, **rows, **another, "ratio": self.ratio}
 
 
-def compare(simulated: SimulatedScans, real: RangeImages, curves: Sequence[str] = CURVES) -> list[CurveScore]:
+def compare(
+    simulated: SimulatedScans,
+    real: RangeImages,
+    curves: Sequence[str] = CURVES,
+    beside: RangeImages | None = None,
+) -> list[CurveScore]:
     """Compare real scans with simulated ones, and with independent drops of one rate, curve by curve.
 
     Args:
         simulated: scans of the real ones' sensor, as many as wanted.
         real: real scans, at least two, in the order of their recording.
+        beside: scans of another real drive, which are compared too.
     """
     _require_two(real)
     if not simulated.clean.sensor.same_rays(real.sensor):
         got, wanted = simulated.clean.sensor.name, real.sensor.name
         raise ConfigError(f"simulated scans of {got!r}", f"the rays of {wanted!r}", "simulate the sensor of the scans")
-    return score_curves(simulated.measured, simulated.clean, real, curves)
+    return score_curves(simulated.measured, simulated.clean, real, curves, beside=beside)
 
 
 def score_curves(
-    own: RangeImage, clean: RangeImage, true: RangeImages | RangeImage, curves: Sequence[str], scans: str = ""
+    own: RangeImage,
+    clean: RangeImage,
+    true: RangeImages | RangeImage,
+    curves: Sequence[str],
+    scans: str = "",
+    beside: RangeImages | None = None,
 ) -> list[CurveScore]:
     """Compare true scans with others, and with independent drops of clean ones, curve by curve.
 
@@ -102,18 +120,21 @@ def score_curves(
         clean: batch of range images in which every surface returns.
         true: measured scans; ``reflectance_histogram`` is left out where one has no reflectance.
         scans: kind of the scans that a model drops returns of; see :class:`CurveScore`.
+        beside: scans of another real drive, which are compared too.
     """
     half = len(true) // 2
-    pixels, returned, reflects = 0, 0, True
-    for batch in _batches(true, 0, len(true)):
+    pixels, returned = 0, 0
+    reflects = beside is None or all(batch.reflectance is not None for batch in batches(beside))
+    for batch in batches(true):
         pixels, returned = pixels + batch.return_mask.numel(), returned + int(batch.return_mask.sum())
         reflects &= batch.reflectance is not None
     independent = drop_independently(clean, returned / pixels)
     return [
         CurveScore(
-            distance(name, [own], _batches(true, 0, len(true))),
-            distance(name, [independent], _batches(true, 0, len(true))),
-            distance(name, _batches(true, 0, half), _batches(true, half, len(true))),
+            distance(name, [own], batches(true)),
+            distance(name, [independent], batches(true)),
+            distance(name, batches(true, 0, half), batches(true, half)),
+            distance(name, batches(beside), batches(true)) if beside else None,
             scans,
         )
         for name in curves
@@ -141,33 +162,70 @@ def drop_independently(clean: RangeImage, return_share: float) -> RangeImage:
     return RangeImage.masked(clean.range_m, mask, clean.sensor, clean.planes)
 
 
-def scans_of_both(
-    streets: Streets, source: Source, sensor: str, config: DataConfig
-) -> tuple[SimulatedScans, RangeImages]:
-    """Simulate scans, and open the real scans that they are compared with.
+@dataclass(frozen=True, eq=False)
+class StreetScans:
+    """Streets that are simulated as the real scans beside them were recorded.
 
     Args:
-        streets: streets that are scanned with the sensor of the real scans.
-        sensor: name or ``.json`` file of the sensor; the source's own if empty.
-        config: columns and projection of both, and their largest number; at most as many real scans as streets.
+        seeds: seeds of the streets.
+        firing: sensor that fires.
+        source: real scans.
+        config: columns and projection of both, and their largest number.
     """
-    seeds = [streets.seeds[index] for index in evenly_spaced(config.max_scans or len(streets), len(streets))]
-    if len(seeds) < 2:
-        got = f"{len(seeds)} simulated scan"
-        raise ConfigError(got, "at least 2", "name more, as simulated:32:test, and no -n 1")
-    firing = load_sensor(sensor) if sensor else source.sensor
-    if "@" in str(streets.root) and not streets.made_by.same_rays(firing):
-        got = f"streets of {streets.made_by.name!r} and scans of {firing.name!r}"
-        raise ConfigError(got, "one sensor", "leave @SENSOR out: streets are scanned as the scans were")
-    real = source.images(config.imaged(firing), replace(config, max_scans=len(seeds)))
-    _require_two(real)
-    pairs = []
-    with reporting.progress("simulating", len(seeds)) as progress:
-        for seed in seeds:
-            pairs.append(simulate_pair(seed, real.sensor, firing))
-            progress.advance(1)
-    clean, measured = (RangeImage.stack(list(images)) for images in zip(*pairs, strict=True))
-    return SimulatedScans(clean, measured), real
+
+    seeds: Sequence[int]
+    firing: SensorModel
+    source: Source
+    config: DataConfig
+
+    @classmethod
+    def of(cls, streets: Streets, source: Source, sensor: str, config: DataConfig) -> "StreetScans":
+        """Choose as many streets and real scans as are wanted, and the sensor of both.
+
+        Args:
+            streets: streets that are scanned with the sensor of the real scans.
+            sensor: name or ``.json`` file of the sensor; the source's own if empty.
+            config: columns and projection of both, and their largest number; at most as many real scans as streets.
+        """
+        seeds = [streets.seeds[index] for index in evenly_spaced(config.max_scans or len(streets), len(streets))]
+        if len(seeds) < 2:
+            got = f"{len(seeds)} simulated scan"
+            raise ConfigError(got, "at least 2", "name more, as simulated:32:test, and no -n 1")
+        firing = load_sensor(sensor) if sensor else source.sensor
+        if "@" in str(streets.root) and not streets.made_by.same_rays(firing):
+            got = f"streets of {streets.made_by.name!r} and scans of {firing.name!r}"
+            raise ConfigError(got, "one sensor", "leave @SENSOR out: streets are scanned as the scans were")
+        return cls(seeds, firing, source, replace(config, max_scans=len(seeds)))
+
+    @property
+    def rays(self) -> SensorModel:
+        """Sensor whose rays the images have."""
+        return self.config.imaged(self.firing)
+
+    def real(self) -> RangeImages:
+        """Return the real scans, at least two."""
+        real = self.source.images(self.rays, self.config)
+        _require_two(real)
+        return real
+
+    def simulated(self) -> SimulatedScans:
+        """Simulate all streets."""
+        clean, measured = (RangeImage.stack(list(images)) for images in zip(*self._pairs(self.rays), strict=True))
+        return SimulatedScans(clean, measured)
+
+    def figures(self, beside: Source | None) -> dict[str, StreetFigures]:
+        """Measure both, and another real drive, in all columns that are fired: noise and outlines need them."""
+        fine = self.rays.fine()
+        sources = {"real": self.source, **({"another real": beside} if beside else {})}
+        simulated = StreetFigures.of(RangeImage.stack([measured]) for _, measured in self._pairs(fine))
+        real = {name: StreetFigures.of(batches(of.images(fine, self.config))) for name, of in sources.items()}
+        return {"simulated": simulated, **real}
+
+    def _pairs(self, rays: SensorModel) -> Iterator[tuple[RangeImage, RangeImage]]:
+        with reporting.progress("simulating", len(self.seeds)) as progress:
+            for seed in self.seeds:
+                yield simulate_pair(seed, rays, self.firing)
+                progress.advance(1)
 
 
 def simulate_pair(seed: int, rays: SensorModel, firing: SensorModel | None = None) -> tuple[RangeImage, RangeImage]:
@@ -202,7 +260,9 @@ def pair_of(seen: Observation, sensor: SensorModel) -> tuple[RangeImage, RangeIm
     return image(within), image(within & torch.from_numpy(seen.return_mask))
 
 
-def _batches(images: RangeImages | RangeImage, first: int, last: int) -> Iterator[RangeImage]:
+def batches(images: RangeImages | RangeImage, first: int = 0, last: int | None = None) -> Iterator[RangeImage]:
+    """Yield batches of images from the first to before the last; all of them if neither is given."""
+    last = len(images) if last is None else last
     for start in range(first, last, _BATCH):
         end = min(start + _BATCH, last)
         yield images[start:end] if isinstance(images, RangeImage) else images.batch(range(start, end))
@@ -213,8 +273,8 @@ def distance(
 ) -> MetricResult:
     """Return the distance of one curve of generated scans from that of real ones."""
     metric = load_metric(name)()
-    for batches, is_real in ((generated, False), (real, True)):
-        for batch in batches:
+    for images, is_real in ((generated, False), (real, True)):
+        for batch in images:
             for start in range(0, len(batch), _BATCH):
                 metric.update(batch[start : start + _BATCH], real=is_real)
     return metric.compute()
@@ -235,11 +295,16 @@ def tables(scores: Sequence[CurveScore]) -> list[Table]:
         of_kind = [score for score in scores if score.scans == scans]
         whose, title = _WHOSE[scans]
         first = of_kind[0]
-        rows = [("scans compared", _counts(first.own), "", "", _counts(first.real_against_real))]
+        another = _counts(first.beside) if first.beside else ""
+        rows = [("scans compared", _counts(first.own), "", "", _counts(first.real_against_real), another)]
         for score in of_kind:
-            own, bernoulli, real = (f"{of.value:.4f}" for of in (score.own, score.bernoulli, score.real_against_real))
-            rows.append((score.own.metric, own, bernoulli, f"{score.ratio:.2f}", real))
-        found.append(Table((title, whose, "Bernoulli", "ratio", "real v real"), tuple(rows)))
+            own, bernoulli, real, another = (
+                f"{of.value:.4f}" if of else ""
+                for of in (score.own, score.bernoulli, score.real_against_real, score.beside)
+            )
+            rows.append((score.own.metric, own, bernoulli, f"{score.ratio:.2f}", real, another))
+        head = (title, whose, "Bernoulli", "ratio", "real v real", "another real")
+        found.append(Table(head, tuple(rows)).without_empty("another real"))
     return found
 
 

@@ -136,9 +136,9 @@ class FoldedUpsample(nn.Module):
         return F.conv_transpose2d(wrapped(x), self.weight, self.bias, stride=2, padding=(1, 3))
 
 
-def group_norm(channels: int, groups: int = 32) -> nn.GroupNorm:
-    """Return the reference's normalisation: epsilon 1e-6, 32 groups unless said otherwise."""
-    return nn.GroupNorm(groups, channels, eps=1e-6)
+def group_norm(channels: int) -> nn.GroupNorm:
+    """Return the reference's normalisation: epsilon 1e-6, 32 groups."""
+    return nn.GroupNorm(32, channels, eps=1e-6)
 
 
 class ResidualBlock(Block):
@@ -150,25 +150,18 @@ class ResidualBlock(Block):
         dropout: probability of dropout before the second convolution.
         padding: values beyond the first and the last column.
         kernel: rows and columns of both convolutions' kernels.
-        norm_groups: number of groups of both norms.
 
     Source:
         The block of the reference's first stage, hamedhaghighi/LidarGRIT@a3f86e7, without its time embedding.
     """
 
     def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        dropout: float,
-        padding: Padding,
-        kernel: tuple[int, int] = (3, 3),
-        norm_groups: int = 32,
+        self, inputs: int, outputs: int, dropout: float, padding: Padding, kernel: tuple[int, int] = (3, 3)
     ) -> None:
         super().__init__()
-        self.norm1 = group_norm(inputs, norm_groups)
+        self.norm1 = group_norm(inputs)
         self.conv1 = Convolution(inputs, outputs, padding, kernel)
-        self.norm2 = group_norm(outputs, norm_groups)
+        self.norm2 = group_norm(outputs)
         self.dropout = nn.Dropout(dropout)
         self.conv2 = Convolution(outputs, outputs, padding, kernel)
         if inputs != outputs:

@@ -36,8 +36,8 @@ ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOT
 MATERIALS: tuple[Material, ...] = (
     Material("asphalt", diffuse=1.66),
     Material("concrete", diffuse=1.09, mottle=0.08),
-    Material("plaster", diffuse=0.715, mottle=0.12),
-    Material("brick", diffuse=1.02, mottle=0.2),
+    Material("plaster", diffuse=1.05, mottle=0.12),
+    Material("brick", diffuse=1.45, mottle=0.2),
     Material("metal", gloss=0.966, lobe_power=30.0),
     Material("paint", diffuse=0.285, gloss=1.36, lobe_power=45.6),
     # Clear glass would pass 0.9; that of cars and houses is made to keep heat out, which begins at this wavelength.

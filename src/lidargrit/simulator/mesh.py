@@ -134,8 +134,8 @@ class Objects:
     def select(self, which: Bool[np.ndarray, " n"]) -> "Objects":
         """Return some of them."""
         some = np.flatnonzero(which)
-        shapes, albedo, label = (tuple(row[at] for at in some) for row in (self.shapes, self.albedo, self.label))
-        return Objects(shapes, self.frame[some], albedo, label, self.instance[some])
+        albedo, label = (tuple(row[at] for at in some) for row in (self.albedo, self.label))
+        return Objects(tuple(self.shapes[at] for at in some), self.frame[some], albedo, label, self.instance[some])
 
     def first_part(self) -> Int64[np.ndarray, " n"]:
         """Return how many parts the objects before each have."""
@@ -147,7 +147,7 @@ class Objects:
             return Mesh.of(np.zeros((0, 3, 3)), 0, 0.0, 0).finish()
         material = [shape.material for shape in self.shapes]
         instance = np.repeat(self.instance, [len(parts) for parts in material])
-        return Finish(*(np.concatenate(column) for column in (material, self.albedo, self.label)), instance)
+        return Finish(np.concatenate(material), np.concatenate(self.albedo), np.concatenate(self.label), instance)
 
     def mesh(self) -> Mesh:
         """Return all their triangles in the scene's frame, object after object."""
@@ -155,5 +155,6 @@ class Objects:
         for shape, frame, first in zip(self.shapes, self.frame, self.first_part(), strict=True):
             moved.append(shape.triangles_m @ frame[:3, :3].T + frame[:3, 3])
             part.append(first + shape.part)
-        columns = (getattr(finish, field.name)[np.concatenate(part)] for field in fields(Finish))
-        return Mesh(*columns, np.concatenate(moved).astype(np.float32))
+        every, triangles_m = np.concatenate(part), np.concatenate(moved).astype(np.float32)
+        material, albedo, label = finish.material[every], finish.albedo[every], finish.label[every]
+        return Mesh(material, albedo, label, finish.instance[every], triangles_m)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int32, UInt16
 
 from lidargrit.scans.marks import mark
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, SensorSetup
 from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.echoes import Echoes, detect_echoes, edges
@@ -19,9 +19,11 @@ from lidargrit.simulator.power import (
     RaydropModel,
     Surfaces,
     levels,
+    range_sigma_m,
     reflectance,
     return_probability,
 )
+from lidargrit.simulator.setups import setup_of
 from lidargrit.simulator.tracing import Tracer, in_reach, objects_in_reach
 
 
@@ -38,8 +40,8 @@ class ObservableScene(Protocol):
         """Return the kept objects at a time, in seconds."""
         ...
 
-    def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
-        """Return the sensor's frame in the scene's at a time."""
+    def sensor_pose(self, time_s: float = 0.0, height_m: float = 1.73) -> Float64[np.ndarray, "4 4"]:
+        """Return the frame in the scene's, at a time, of a sensor of some height above the road."""
         ...
 
 
@@ -147,14 +149,15 @@ def observe_scene(
 
     Args:
         scene: triangles and sensor poses.
-        scene_rng: source of what stays the same from one revolution to the next: the gain of every object.
+        scene_rng: source of what stays the same from one revolution to the next: the gain of every object, and the
+            set-up of a sensor of which there are no scans.
         beam_rng: source of what differs from one revolution to the next.
         config: time, motion, wetness and raydrop model.
     """
-    model = config.model
-    begun, ended = (scene.sensor_pose(config.time_s + after_s) for after_s in (0.0, REVOLUTION_S))
+    model, setup = config.model, setup_of(sensor, scene_rng)
+    begun, ended = (scene.sensor_pose(config.time_s + after_s, setup.height_m) for after_s in (0.0, REVOLUTION_S))
     poses = (begun, ended) if config.motion else (begun,)
-    beams = Beams.sample(sensor, beam_rng, model.gap_share)
+    beams = Beams.sample(sensor, beam_rng, setup.gap_share)
     height, fine_width = beams.azimuth_rad.shape
     beam_noise = BeamNoise.sample(beam_rng, height, fine_width, model)
     stride = fine_width // sensor.width if config.kept_columns_only else 1
@@ -165,7 +168,7 @@ def observe_scene(
     mesh = in_reach(scene.standing, poses, elevations_rad, sensor.range_max_m)
     objects = objects_in_reach(scene.objects(config.time_s), poses, sensor.range_max_m)
     finish = Finish.join([mesh.finish(), objects.finish()])
-    tracer, surfaces = Tracer(mesh, sensor.range_max_m, objects), Surfaces.of(finish, model, config.wet)
+    tracer, surfaces = Tracer(mesh, sensor.range_max_m, objects), Surfaces.of(finish, model, setup, config.wet)
     rays = looked.rays(*poses)
     first = tracer.cast(*rays)
     range_m = first.range_m.reshape(looked.azimuth_rad.shape)
@@ -174,10 +177,9 @@ def observe_scene(
     else:
         beside = _beside(tracer, beams, poses, stride)
     edge = edges(range_m, *beside, model.edge_share).ravel()
-    echoes = detect_echoes(tracer, surfaces, rays, first, edge, model)
-    limits_m = sensor.range_min_m, sensor.range_max_m
-    lasers = Lasers.of(sensor, model)
-    seen = _measure(finish, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
+    echoes = detect_echoes(tracer, surfaces, rays, first, edge, model, setup)
+    limits_m = sensor.range_min_m, min(setup.farthest_m or sensor.range_max_m, sensor.range_max_m)
+    seen = _measure(finish, surfaces, echoes, looked, setup, beam_noise, scene_rng, limits_m, begun, model)
     fired_s = np.broadcast_to(looked.turn * np.float32(REVOLUTION_S), seen.range_m.shape)
     return replace(seen, fired_s=fired_s) if config.motion else seen
 
@@ -208,7 +210,7 @@ def _measure(
     surfaces: Surfaces,
     echoes: Echoes,
     beams: Beams,
-    lasers: Lasers,
+    setup: SensorSetup,
     beam_noise: BeamNoise,
     scene_rng: np.random.Generator,
     limits_m: tuple[float, float],
@@ -216,16 +218,17 @@ def _measure(
     model: RaydropModel,
 ) -> Observation:
     """Decide by chance which echoes are noticed, and what is read from them."""
-    shape = beams.azimuth_rad.shape
+    shape, lasers = beams.azimuth_rad.shape, Lasers.of(setup, len(beams.azimuth_rad))
     label = np.append(finish.label, np.uint16(0))[echoes.triangle]
     instance = np.append(finish.instance, np.int32(0))[echoes.triangle]
     of_object = _object_gains(finish, scene_rng, model)[instance]
     log_gain = (lasers.log_gain + beam_noise.patch).ravel() + of_object
     level = levels(echoes.power, log_gain, model)
     clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])
-    probability = np.where(clear, return_probability(level, model), np.float32(0))
+    probability = np.where(clear, return_probability(level, model, setup.gap_share), np.float32(0))
     pulse_noise = np.float32(model.pulse_spread) * beam_noise.pulse.ravel()
-    range_m = echoes.range_m + np.float32(model.range_sigma_m) * beam_noise.range_noise.ravel()
+    sigma_m = range_sigma_m(np.minimum(echoes.range_m, limits_m[1]), echoes.cos_incidence, setup).reshape(shape)
+    range_m = echoes.range_m + (lasers.offset_m + sigma_m * beam_noise.range_noise).ravel()
     came_back = clear & beams.fired.ravel() & (level + pulse_noise > 0)
     came_back &= (range_m >= limits_m[0]) & (range_m <= limits_m[1])
     specular = surfaces.specular(echoes.triangle, echoes.cos_incidence)
@@ -234,7 +237,7 @@ def _measure(
     scattered = (scattered.reshape(shape) * lasers.reading).ravel()
     # The very pulse that comes back stronger reads brighter.
     chance = beam_noise.pulse.ravel() * surfaces.mottle[surfaces.material[echoes.triangle]]
-    bright = reflectance(scattered, specular, level + pulse_noise, chance, model)
+    bright = reflectance(scattered, specular, level + pulse_noise, chance, model, setup.reflectance_scale)
     return Observation(
         clean_range_m=np.where(np.isinf(echoes.range_m), np.float32(0), echoes.range_m).reshape(shape),
         return_probability=probability.reshape(shape),

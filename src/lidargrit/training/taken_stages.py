@@ -17,7 +17,10 @@ from lidargrit.generation.settings import Preset
 from lidargrit.training.checkpoint import load_average
 
 _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
-_NOT_LEARNED = ("range_temperature", "distilled_steps", "distilled_pairs")  # of sampling, and of another stage
+_NOT_LEARNED = (  # of sampling, and of another stage
+    *("range_temperature", "coarse_range_temperature"),
+    *("distilled_steps", "distilled_pairs"),
+)
 
 
 def taken_facts(preset: Preset) -> dict[str, Any]:

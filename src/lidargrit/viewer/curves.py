@@ -29,8 +29,9 @@ def plot_curves(scores: Sequence[CurveScore], path: Path, title: str = "") -> No
     """Plot the curves of real scans, of simulated ones, and of independent drops: a panel for each score.
 
     Curves with two axes, such as a histogram for every row, get one image for each of the three, and the mean over
-    rows where rows are of one kind.
+    rows where rows are of one kind. Scores without a curve are left out.
     """
+    scores = [score for score in scores if "axis" in score.own.details]
     if not scores:
         raise ConfigError("no curve", "at least one", "compare some scans first")
     flat = [score for score in scores if _curve(score, "real").ndim == 1]

@@ -14,7 +14,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.imaging import Imaging, choose_imaging
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages, is_prepared
-from lidargrit.data.run_folder import is_run, is_unfinished, locate, read_config, recorded_projection, trained_on
+from lidargrit.data.run_folder import is_run, is_unfinished, locate, read_config, recorded_projection
 from lidargrit.data.sources.image_files import ImageFileSource, image_files
 from lidargrit.data.sources.sample_formats import (
     is_tensor_folder,
@@ -23,7 +23,7 @@ from lidargrit.data.sources.sample_formats import (
     recognise,
     sensor_of_tensors,
 )
-from lidargrit.data.sources.samples import is_sample_folder, projection_of, read_samples, weights_of
+from lidargrit.data.sources.samples import is_sample_folder, read_facts, read_samples
 from lidargrit.data.sources.source import Source
 from lidargrit.scans.many_scans import usable_scans
 from lidargrit.scans.projection.sensor_check import closest_sensor
@@ -38,7 +38,7 @@ class DatasetSource(Source):
         bad_points: treatment of NaN, infinite and origin points.
     """
 
-    kind = "scans"
+    kind, has_points = "scans", True
 
     def __init__(self, text: str, bad_points: BadPoints = "refuse") -> None:
         super().__init__(text)
@@ -46,7 +46,6 @@ class DatasetSource(Source):
         is_of_others = self._dataset.origin_of(self._dataset.root) == "folder"
         self.data_set = "folder" if is_of_others else self._dataset.public_name()
         self.split = self._dataset.split
-        self._imaged_by = ""
 
     @property
     def sensor(self) -> SensorModel:
@@ -71,10 +70,6 @@ class DatasetSource(Source):
         reporting.message(told)
         return name
 
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant of the images that were opened last, else the one that the configuration names."""
-        return self._imaged_by or config.projection_variant
-
     def scans(self) -> ScanDataset:
         """Return the data set, as it was opened."""
         return self._dataset
@@ -87,7 +82,7 @@ class DatasetSource(Source):
         sensor, config = imaging.sensor, imaging.config
         folder = prepare(self.text, config, sensor=sensor, dataset=self._dataset)
         prepared = PreparedImages(str(folder))
-        self.doubts, self._imaged_by = (*imaging.doubts, *prepared.doubts()), config.projection_variant
+        self.doubts, self.projection_variant = (*imaging.doubts, *prepared.doubts()), config.projection_variant
         _require_some(self.text, prepared)
         return RangeImages(sensor, [prepared])
 
@@ -109,15 +104,12 @@ class PreparedSource(Source):
         super().__init__(text)
         self._prepared = PreparedImages(text)
         self.data_set, self.split = _data_set_or_nothing(self._prepared.spec.source)
+        self.projection_variant = self._prepared.spec.variant
 
     @property
     def sensor(self) -> SensorModel:
         """Sensor of the images, with all its fine columns."""
         return self._prepared.sensor
-
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant that the scans were prepared by."""
-        return self._prepared.spec.variant
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the images, with all columns that were prepared, or with fewer if the sensor has fewer."""
@@ -139,28 +131,17 @@ class SampleSource(Source):
 
     def __init__(self, text: str, folder: Path) -> None:
         super().__init__(text)
-        self.folder = folder
+        self._folder = self.folder = folder
+        self._sensor, self.projection_variant, self.full_rows, self.weights_sha256, _ = read_facts(folder)
 
     @property
     def sensor(self) -> SensorModel:
         """Sensor of the samples."""
-        return read_samples(self.folder).sensor
-
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant by which the training scans of the model became images."""
-        return projection_of(self.folder)
+        return self._sensor
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the samples, or so many of them, evenly spaced."""
-        return read_samples(self.folder, (config or DataConfig()).max_scans or None)
-
-    def learned_from(self) -> Provenance:
-        """Return the training scans of the model that generated the samples."""
-        return trained_on(self.folder)
-
-    def weights_sha256(self) -> str:
-        """Return the hash of the weights of this model."""
-        return weights_of(self.folder)
+        return read_samples(self._folder, (config or DataConfig()).max_scans or None)
 
 
 class TensorSource(Source):
@@ -177,16 +158,12 @@ class TensorSource(Source):
     def __init__(self, text: str, folder: Path, samples_format: str = "") -> None:
         super().__init__(text)
         self._folder, self.split = folder, samples_format or recognise(folder)
-        self._format = load_sample_format(self.split)
+        self.projection_variant = load_sample_format(self.split).variant
 
     @property
     def sensor(self) -> SensorModel:
         """Sensor that the size of the first tensor fits."""
         return sensor_of_tensors(self._folder, self.split)
-
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant that the program projects its training scans by."""
-        return self._format.variant
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the samples, or so many of them, evenly spaced."""
@@ -200,25 +177,18 @@ class RunSource(Source):
 
     def __init__(self, text: str, folder: Path) -> None:
         super().__init__(text)
-        self.folder = folder
+        self.folder, self.projection_variant = folder, recorded_projection(folder)
+        self._sensor = read_config(folder).sensor
 
     @property
     def sensor(self) -> SensorModel:
         """Sensor of the scans that are generated."""
-        return read_config(self.folder).sensor
-
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant by which the training scans became images."""
-        return recorded_projection(self.folder)
+        return self._sensor
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Refuse: scans have to be generated first."""
         cure = f"generate some first with: lidargrit sample {self.text} FOLDER"
         raise DataError(f"{self.text}, which holds {self.kind}", "scans or samples", cure)
-
-    def learned_from(self) -> Provenance:
-        """Return the training scans of the model."""
-        return trained_on(self.folder)
 
 
 def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str = "") -> Source:

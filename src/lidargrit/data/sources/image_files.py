@@ -57,10 +57,6 @@ class ImageFileSource(Source):
             "name it with --sensor NAME or FILE.json, which may have other columns",
         )
 
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return "": nothing tells how the images were made."""
-        return ""
-
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Read the images, which have the rows and columns of the sensor."""
         sensor, count = sensor or self.sensor, len(self._paths)

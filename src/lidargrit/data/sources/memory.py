@@ -32,15 +32,11 @@ class MemorySource(Source):
         """Sensor that made the scans."""
         return self._sensor
 
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant that the configuration names."""
-        return config.projection_variant
-
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans, or so many of them, evenly spaced."""
         sensor, config = sensor or self.sensor, config or DataConfig()
         chosen = evenly_spaced(config.max_scans or len(self._scans), len(self._scans))
-        by = config.projection_variant
+        self.projection_variant = by = config.projection_variant
         images = [project_by_what_fits(self._scans[index], sensor, by)[0] for index in chosen]
         return RangeImages(sensor, [_Images(images)])
 

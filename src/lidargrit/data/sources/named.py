@@ -13,7 +13,7 @@ from lidargrit.data.datasets import ScanDataset, Window
 from lidargrit.data.formats import read_scan
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import DatasetSource, open_source
+from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.source import Source
 from lidargrit.scans.many_scans import usable_scans
@@ -164,7 +164,7 @@ def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None =
     Args:
         sensor: sensor of range images that do not name theirs; see :meth:`Source.images`.
     """
-    if isinstance(source, DatasetSource):
+    if source.has_points:
         return PointScans(source.scans(), config.max_scans)
     images = source.images(sensor, source.as_projected(replace(config, max_scans=0)))
     names = [f"{number:06d}" for number in range(len(images))]

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,46 @@ from lidargrit.scans.sensors import SensorModel
 MANIFEST = "samples.json"
 
 
+class SampleFacts(NamedTuple):
+    """What the manifest of a folder of samples says of them and of their model.
+
+    Args:
+        sensor: sensor of the samples.
+        projection_variant: variant of the projection by which the model's training scans became images; "" if unknown.
+        full_rows: rows in which every ray returns, with none in the others; None where rays may drop.
+        weights_sha256: hash of the weights that generated the samples; "" if unknown.
+        model_and_sampling: hash that two sets of samples share if equal seeds in them are the same scans.
+    """
+
+    sensor: SensorModel
+    projection_variant: str
+    full_rows: range | None
+    weights_sha256: str
+    model_and_sampling: str
+
+
+def read_facts(folder: Path) -> SampleFacts:
+    """Read the manifest of a folder that :func:`lidargrit.inference.samples.write_samples` wrote."""
+    manifest, wanted = read_json(folder / MANIFEST), "what lidargrit wrote"
+    try:
+        sensor = SensorModel.from_json(manifest["sensor"])
+    except (KeyError, TypeError, ConfigError) as error:
+        reason = error.got if isinstance(error, ConfigError) else error
+        raise CheckpointError(f"{folder / MANIFEST}, in which {reason}", wanted, "sample anew") from None
+    rows = manifest.get("full_rows")
+    if rows is not None and not (isinstance(rows, list) and [*map(type, rows)] == [int, int]):
+        raise CheckpointError(f"{folder / MANIFEST}, whose full_rows are no two rows", wanted, "restore it")
+    variant, weights = (manifest.get(name) for name in ("projection_variant", "weights_sha256"))
+    made_by = [manifest.get(name) for name in ("weights_sha256", "config", "sampling")]
+    return SampleFacts(
+        sensor,
+        variant if isinstance(variant, str) else "",
+        None if rows is None else range(*rows),
+        weights if isinstance(weights, str) else "",
+        hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:8],
+    )
+
+
 def read_samples(folder: Path, count: int | None = None) -> RangeImages:
     """Return the samples of a folder in the order of their seeds; read when asked for.
 
@@ -26,14 +66,7 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
         folder: folder that :func:`lidargrit.inference.samples.write_samples` wrote.
         count: largest number of scans, evenly spaced over the seeds; all if not given.
     """
-    manifest = read_json(folder / MANIFEST)
-    try:
-        sensor = SensorModel.from_json(manifest["sensor"])
-    except (KeyError, TypeError, ConfigError) as error:
-        reason = error.got if isinstance(error, ConfigError) else error
-        raise CheckpointError(
-            f"{folder / MANIFEST}, in which {reason}", "what lidargrit wrote", "sample anew"
-        ) from None
+    facts = read_facts(folder)
     files = folder.glob("[!.]*.npz")  # not what a killed process left half-written
     paths = sorted(files, key=lambda path: (len(path.stem), path.stem))  # seeds above eight digits come last
     if count:
@@ -42,37 +75,7 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
         raise DataError(
             f"no sample in {folder}", "at least one", "generate some with: lidargrit sample RUN " + str(folder)
         )
-    return RangeImages(sensor, [_Files(paths, sensor, _model_and_sampling(manifest))])
-
-
-def projection_of(folder: Path) -> str:
-    """Return by which variant of the projection the training scans of the samples' model became images.
-
-    "" where that is not known.
-    """
-    manifest = read_json(folder / MANIFEST)
-    variant = manifest.get("projection_variant") if isinstance(manifest, dict) else None
-    return variant if isinstance(variant, str) else ""
-
-
-def full_rows_of(folder: Path) -> range | None:
-    """Return the rows in which every ray of the samples returns, with none in the others; None where rays may drop."""
-    manifest = read_json(folder / MANIFEST)
-    rows = manifest.get("full_rows") if isinstance(manifest, dict) else None
-    if rows is None:
-        return None
-    if not (isinstance(rows, list) and len(rows) == 2 and all(type(row) is int for row in rows)):
-        raise CheckpointError(
-            f"{folder / MANIFEST}, whose full_rows are no two rows", "what lidargrit wrote", "restore it"
-        )
-    return range(*rows)
-
-
-def weights_of(folder: Path) -> str:
-    """Return the hash of the weights that generated the samples of a folder; "" where the folder does not tell."""
-    manifest = read_json(folder / MANIFEST)
-    found = manifest.get("weights_sha256") if isinstance(manifest, dict) else None
-    return found if isinstance(found, str) else ""
+    return RangeImages(facts.sensor, [_Files(paths, facts.sensor, facts.model_and_sampling)])
 
 
 def is_sample_folder(folder: Path) -> bool:
@@ -114,9 +117,3 @@ class _Files:
         ):
             raise ScanError(f"a damaged reflectance in {path}", f"float32 {self._shape} in [0, 1]", cure)
         return Pixels(range_m, {} if reflectance is None else {"reflectance": reflectance})
-
-
-def _model_and_sampling(manifest: dict[str, Any]) -> str:
-    """Return what two sets of samples share if equal seeds in them are the same scans: model and settings."""
-    facts = [manifest.get(name) for name in ("weights_sha256", "config", "sampling")]
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:8]

@@ -2,12 +2,14 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 from lidargrit.core.errors import DataError
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.run_folder import trained_on
 from lidargrit.scans.sensors import SensorModel
 
 
@@ -26,6 +28,16 @@ class Source(ABC):
     """Part of the data set, or the sample format of tensors; "" where there is none."""
     doubts: tuple[str, ...] = ()
     """Reasons to doubt the images that were opened last: made by another sensor, or of mixed scales of reflectance."""
+    has_points: ClassVar[bool] = False
+    """Whether it has the points of scans, not images of them alone: see :meth:`scans`."""
+    projection_variant: str = ""
+    """Variant of the projection by which its scans became images, or :meth:`images` made them; "" if not known."""
+    folder: Path | None = None
+    """Folder of the run, or of the samples, that tells which scans its model learned from."""
+    weights_sha256: str = ""
+    """Hash of the weights that generated the scans; "" where there are none, or it is not known."""
+    full_rows: range | None = None
+    """Rows in which every ray of generated scans returns, with none in the others; None where rays may drop."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -40,13 +52,14 @@ class Source(ABC):
         """Name or file of the sensor that made the scans; "" for images, which hold theirs."""
         return ""
 
-    @abstractmethod
-    def projection_variant(self, config: DataConfig) -> str:
-        """Return the variant of the projection by which scans become, or became, images; "" where it is not known."""
+    @property
+    def is_generated(self) -> bool:
+        """Whether its images were generated, and so keep their sensor."""
+        return self.data_set == "samples"
 
     def as_projected(self, config: DataConfig) -> DataConfig:
         """Return a configuration with the variant by which scans that are images already were projected."""
-        return replace(config, projection_variant=self.projection_variant(config) or config.projection_variant)
+        return replace(config, projection_variant=self.projection_variant or config.projection_variant)
 
     @abstractmethod
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
@@ -71,8 +84,4 @@ class Source(ABC):
 
     def learned_from(self) -> Provenance | None:
         """Return the training scans of the model behind the source; None where no model is behind it."""
-        return None
-
-    def weights_sha256(self) -> str:
-        """Return the hash of the weights that generated the scans; "" where there are none, or it is not known."""
-        return ""
+        return None if self.folder is None else trained_on(self.folder)

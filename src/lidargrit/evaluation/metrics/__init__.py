@@ -9,7 +9,6 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, final
 
 import numpy as np
 import torch
-from torch import distributed
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, nearest_names
@@ -206,20 +205,6 @@ class Metric(ABC, Generic[Features, Kept]):
 
         A score of half of the scans then is of the same statistic as that of all.
         """
-
-    def reduce(self) -> None:
-        """Take in what all other processes of ``torch.distributed``'s group have gathered, in the order of their ranks.
-
-        Every process must call it, and each then has the number for all images; alone, a process keeps what it has.
-        """
-        if not (distributed.is_available() and distributed.is_initialized()):
-            return
-        everyone: list[Metric[Features, Kept] | None] = [None] * distributed.get_world_size()
-        distributed.all_gather_object(everyone, self)
-        first, *others = (metric for metric in everyone if metric is not None)
-        for other in others:
-            first.merge(other)
-        vars(self).update(vars(first))
 
     def require_same_options(self, other: "Metric[Features, Kept]") -> None:
         """Refuse to merge with a metric of another kind, variant or seed."""

@@ -35,6 +35,7 @@ class PointCloudJsd(CloudMetric):
     title = "Jensen-Shannon divergence of point clouds in space"
     bounds = (0.0, 1.0)
     of_equal_sets: ClassVar = {"reference": "its program adds 1e-8 to every share"}
+    fewest_images = 1
     accumulator = SumAccumulator
 
     def summarise(self, features: Clouds, *, real: bool) -> Int64[np.ndarray, "grid"]:

@@ -63,20 +63,21 @@ class WallStraightness(CurveMetric):
 
 def unbroken_runs(images: RangeImage) -> Bool[Tensor, "B H W"]:
     """Return at which pixels a run of 8 returns without an edge begins."""
-    range_m = torch.where(images.return_mask, images.range_m, torch.nan)
+    return unbroken(torch.where(images.return_mask, images.range_m, torch.nan), _RUN)
+
+
+def unbroken(range_m: Float[Tensor, "B H W"], length: int) -> Bool[Tensor, "B H W"]:
+    """Return where a run without an edge begins in circular rows; ranges are in metres, NaN for no return."""
     next_m = range_m.roll(-1, dims=-1)
     # Ranges agree within a tenth if their inverses do, and no comparison with NaN holds.
     connected = (range_m - next_m).abs() <= ONE_SURFACE * torch.maximum(range_m, next_m)
-    return run_sums(connected.double(), _RUN - 1) == _RUN - 1
+    return run_sums(connected.double(), length - 1) == length - 1
 
 
 def upright_runs(points_xyz_m: Float[Tensor, "B H W 3"], return_mask: Bool[Tensor, "B H W"]) -> Bool[Tensor, "B H W"]:
     """Return at which pixels a run begins whose surface is steeper than 45 degrees, up to the row above or below."""
-    step = max(1, points_xyz_m.shape[1] // _ROWS)
-    returns = run_sums(return_mask.double(), _RUN)
-    returns = torch.where(returns >= _RUN / 2, returns, torch.nan)
-    distance_m, height_m = points_xyz_m[..., :2].norm(dim=-1), points_xyz_m[..., 2]
-    means_m = [run_sums(each * return_mask, _RUN) / returns for each in (distance_m, height_m)]
+    step = row_step(points_xyz_m.shape[1])
+    means_m = run_means(points_xyz_m, return_mask)
     across_m, up_m = ((each[:, :-step] - each[:, step:]).abs() for each in means_m)
     steep = up_m > across_m
     upright = torch.zeros_like(return_mask)
@@ -85,12 +86,32 @@ def upright_runs(points_xyz_m: Float[Tensor, "B H W 3"], return_mask: Bool[Tenso
     return upright
 
 
-def distance_from_line(x_m: Float[Tensor, "B H W"], y_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
+def row_step(height: int) -> int:
+    """Return how many rows apart the rows are that tell how steep a surface is: one of 32, two of 64."""
+    return max(1, height // _ROWS)
+
+
+def run_means(
+    points_xyz_m: Float[Tensor, "B H W 3"], return_mask: Bool[Tensor, "B H W"]
+) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"]]:
+    """Return mean horizontal distance and mean height of the run from each pixel; NaN where less than half returns."""
+    returns = run_sums(return_mask.double(), _RUN)
+    returns = torch.where(returns >= _RUN / 2, returns, torch.nan)
+    distance_m, height_m = (
+        run_sums(each * return_mask, _RUN) / returns
+        for each in (points_xyz_m[..., :2].norm(dim=-1), points_xyz_m[..., 2])
+    )
+    return distance_m, height_m
+
+
+def distance_from_line(
+    x_m: Float[Tensor, "B H W"], y_m: Float[Tensor, "B H W"], length: int = _RUN
+) -> Float[Tensor, "B H W"]:
     """Return the root mean square distance of the run that begins at each pixel from the line that fits it best.
 
     It is the root of the smaller eigenvalue of the covariance of its points.
     """
-    runs = [torch.cat((each, each[..., : _RUN - 1]), dim=-1).unfold(-1, _RUN, 1) for each in (x_m, y_m)]
+    runs = [torch.cat((each, each[..., : length - 1]), dim=-1).unfold(-1, length, 1) for each in (x_m, y_m)]
     x, y = (run - run.mean(dim=-1, keepdim=True) for run in runs)
     xx, yy, xy = (x * x).mean(dim=-1), (y * y).mean(dim=-1), (x * y).mean(dim=-1)
     smaller = (xx + yy) / 2 - torch.hypot((xx - yy) / 2, xy)

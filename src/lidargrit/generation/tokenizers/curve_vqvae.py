@@ -42,7 +42,7 @@ class CurveVqvaeConfig(TokenizerConfig):
     """Sizes and losses of the VQ-VAE; the defaults are those of LiDM's ``f_c2_p4``: curves of 2, then patches of 4.
 
     Args:
-        channels: number of channels at the finest level, a multiple of ``norm_groups``.
+        channels: number of channels at the finest level, a multiple of 32.
         channel_multipliers: channels of each level, from fine to coarse, over those of the finest.
         row_strides: number of rows of each level that become one row at the next coarser level, 1 or 2; columns are
             always halved.
@@ -59,11 +59,9 @@ class CurveVqvaeConfig(TokenizerConfig):
             the same bug as ``reference``.
         restart_dead_codes: whether codes that are hardly ever used restart from latents; LiDM's program does not do
             this.
-        norm_groups: number of groups of every group norm. A group of one channel loses its mean over the image: 32
-            channels of a small network in 32 groups know of no mean level.
     """
 
-    channels: Count = 64
+    channels: Annotated[int, Bounds(32, multiple_of=32)] = 64  # the norms share 32 groups
     channel_multipliers: Annotated[tuple[Count, ...], Bounds(1, 16)] = (1, 2, 2, 4)
     row_strides: tuple[Literal[1, 2], ...] = (1, 2, 2)
     residual_blocks: ResidualBlocks = 2
@@ -74,14 +72,9 @@ class CurveVqvaeConfig(TokenizerConfig):
     mask_head: bool = False
     codebook_loss: CodebookLoss = "reference"
     restart_dead_codes: bool = False
-    norm_groups: Count = 32
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.channels % self.norm_groups:
-            raise ConfigError(
-                f"channels={self.channels}", f"a multiple of norm_groups={self.norm_groups}", "round it up"
-            )
         multipliers, strides = self.channel_multipliers, self.row_strides
         if len(multipliers) != len(strides) + 1:
             raise ConfigError(
@@ -97,9 +90,9 @@ class CurveVqvaeConfig(TokenizerConfig):
         return [self.channels * multiplier for multiplier in self.channel_multipliers]
 
 
-def _level(inputs: int, width: int, num_blocks: int, kernel: tuple[int, int], norm_groups: int) -> Level:
+def _level(inputs: int, width: int, num_blocks: int, kernel: tuple[int, int]) -> Level:
     widths = [inputs, *[width] * num_blocks]
-    return Level([ResidualBlock(*pair, 0.0, "wrap", kernel, norm_groups) for pair in pairwise(widths)])
+    return Level([ResidualBlock(*pair, 0.0, "wrap", kernel) for pair in pairwise(widths)])
 
 
 class CurveUpsample(nn.Module):
@@ -119,9 +112,9 @@ class CurveUpsample(nn.Module):
 class LatentAttention(Block):
     """Self-attention between all latents, with one head."""
 
-    def __init__(self, channels: int, norm_groups: int) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = group_norm(channels, norm_groups)
+        self.norm = group_norm(channels)
         self.q, self.k, self.v, self.proj_out = (nn.Conv2d(channels, channels, 1) for _ in range(4))
 
     def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
@@ -135,11 +128,11 @@ class LatentAttention(Block):
 class CurveMiddle(nn.Module):
     """The blocks at the coarsest level, with attention between them."""
 
-    def __init__(self, width: int, norm_groups: int) -> None:
+    def __init__(self, width: int) -> None:
         super().__init__()
-        self.block_1 = ResidualBlock(width, width, 0.0, "wrap", norm_groups=norm_groups)
-        self.attn_1 = LatentAttention(width, norm_groups)
-        self.block_2 = ResidualBlock(width, width, 0.0, "wrap", norm_groups=norm_groups)
+        self.block_1 = ResidualBlock(width, width, 0.0, "wrap")
+        self.attn_1 = LatentAttention(width)
+        self.block_2 = ResidualBlock(width, width, 0.0, "wrap")
 
     def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
         """Return feature maps of the same size."""
@@ -153,13 +146,13 @@ class CurveEncoder(ConvolutionalEncoder):
         super().__init__()
         widths = config.widths()
         self.conv_in = Convolution(1, config.channels, "wrap")
-        pairs, groups = pairwise([config.channels, *widths]), config.norm_groups
-        levels = [_level(*pair, config.residual_blocks, _SQUARE, groups) for pair in pairs]
+        pairs = pairwise([config.channels, *widths])
+        levels = [_level(*pair, config.residual_blocks, _SQUARE) for pair in pairs]
         for level, width, row_stride in zip(levels, widths, config.row_strides, strict=False):  # not the coarsest
             level.downsample = Downsample(width, "wrap", row_stride)
         self.down = nn.ModuleList(levels)
-        self.mid = CurveMiddle(widths[-1], config.norm_groups)
-        self.norm_out = group_norm(widths[-1], config.norm_groups)
+        self.mid = CurveMiddle(widths[-1])
+        self.norm_out = group_norm(widths[-1])
         self.conv_out = Convolution(widths[-1], config.code_dim, "wrap")
 
 
@@ -170,17 +163,17 @@ class CurveDecoder(ConvolutionalDecoder):
         super().__init__()
         widths = config.widths()
         self.conv_in = Convolution(config.code_dim, widths[-1], "wrap")
-        self.mid = CurveMiddle(widths[-1], config.norm_groups)
+        self.mid = CurveMiddle(widths[-1])
         levels = []  # from coarse to fine; the finest level has no stride of its own, and is a curve's
         strides = [*reversed(config.row_strides), 1]
         for pair, row_stride in zip(pairwise([widths[-1], *reversed(widths)]), strides, strict=True):
             kernel = _CURVE if row_stride == 1 else _SQUARE
-            level = _level(*pair, config.residual_blocks + 1, kernel, config.norm_groups)
+            level = _level(*pair, config.residual_blocks + 1, kernel)
             if len(levels) < len(config.row_strides):
                 level.upsample = CurveUpsample(pair[1], row_stride)
             levels.append(level)
         self.up = nn.ModuleList(reversed(levels))
-        self.norm_out = group_norm(widths[0], config.norm_groups)
+        self.norm_out = group_norm(widths[0])
         self.conv_out = Convolution(widths[0], 1 + config.mask_head, "wrap", _CURVE)
 
 

@@ -47,9 +47,6 @@ _NO_RETURN_BELOW = -0.9  # without a raydrop head, an encoded range below this i
 
 _SETTING = "model.tokenizer.reflectance"
 
-_ROWS_BESIDE, _COLUMNS_BESIDE = 4, 3  # on each side: 3.4 and 1.1 degrees of 64x1024
-_SAME_WITHIN = 0.05  # of the range
-
 
 @dataclass(frozen=True)
 class VqvaeConfig(TokenizerConfig):
@@ -79,8 +76,6 @@ class VqvaeConfig(TokenizerConfig):
         error_unit: ``encoded`` for the error between encodings, as in the paper; ``metres`` for the error between
             ranges, scaled so that with the linear encoding the two are equal. With the logarithmic encoding the first
             weighs near surfaces more, the second far ones.
-        thin_weight: weight added to the error of the range at pixels of thin upright things and of upright edges, such
-            as poles, trunks and corners; see :func:`upright_and_thin`. 0 in the paper, whose mean error lets them go.
         reflectance: whether reflectance is encoded and decoded beside the range; not so in the paper.
         reflectance_weight: weight of the mean absolute error of the reflectance of returns, mapped to [-1, 1] as the
             encoded range is. 1 as in R2DM and LiDARGen, whose losses weigh the channels of range and reflectance alike.
@@ -102,7 +97,6 @@ class VqvaeConfig(TokenizerConfig):
     raydrop_weight: Weight = 0.1
     reconstruction: Literal["paper", "reference", "returns"] = "paper"
     error_unit: Literal["encoded", "metres"] = "encoded"
-    thin_weight: Weight = 0.0
     reflectance: bool = False
     reflectance_weight: Weight = 1.0
     codebook_loss: CodebookLoss = "paper"
@@ -266,10 +260,7 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         if self.config.raydrop_loss:
             kind = self.config.reconstruction
             kept = torch.bernoulli(return_logits.detach().sigmoid(), generator=rng) > 0 if kind == "reference" else mask
-            weights = None
-            if self.config.thin_weight:
-                weights = 1 + self.config.thin_weight * upright_and_thin(images.range_m, mask)
-            terms["reconstruction"] = reconstruction_loss(*pair, mask, kept, kind, weights)
+            terms["reconstruction"] = reconstruction_loss(*pair, mask, kept, kind)
             terms["raydrop"] = F.binary_cross_entropy_with_logits(return_logits, mask.to(return_logits.dtype))
             loss = terms["reconstruction"] + self.config.raydrop_weight * terms["raydrop"] + z.loss
         else:
@@ -305,14 +296,12 @@ def reconstruction_loss(
     return_mask: Bool[Tensor, "B H W"],
     sampled_mask: Bool[Tensor, "B H W"],
     kind: Literal["paper", "reference", "returns"],
-    weights: Float[Tensor, "B H W"] | None = None,
 ) -> Float[Tensor, ""]:
     """Return the masked absolute error of the encoded range on the pixels that truly returned.
 
     Args:
         sampled_mask: returns that were sampled, for ``reference``.
         kind: pixels that count, and the divisor.
-        weights: weights of the pixels; those of each scan's returns are scaled to a mean of 1.
 
     Source:
         ``paper``: eq. 2, clean range over all pixels. ``reference``: hamedhaghighi/LidarGRIT@a3f86e7, range composed
@@ -321,34 +310,9 @@ def reconstruction_loss(
     if kind == "reference":
         encoded = torch.where(sampled_mask, encoded, -1.0)
     error = (encoded - target).abs() * return_mask
-    if weights is not None:
-        returns = return_mask.sum((1, 2), keepdim=True)
-        error = error * weights * (returns / (weights * return_mask).sum((1, 2), keepdim=True).clamp(min=1e-6))
     if kind == "paper":
         return error.mean()
     return (error.sum((1, 2)) / return_mask.sum((1, 2)).clamp(min=1)).mean()
-
-
-def upright_and_thin(range_m: Float[Tensor, "B H W"], return_mask: Bool[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
-    """Return how far a pixel belongs to something upright that is thin, in [0, 1].
-
-    It is the share of the 8 nearest pixels of its column at its own range, times the share of the 6 nearest of its row
-    that are not. Poles, trunks and corners have both, walls and the ground have the first or none, leaves have little
-    of the first. Ranges are the same within 5 %.
-
-    Args:
-        return_mask: pixels with a return; others are at no range.
-    """
-    v = torch.where(return_mask, range_m.clamp(min=1e-3).log(), -99.0)
-    height = range_m.shape[1]
-    columns = F.pad(v, (0, 0, _ROWS_BESIDE, _ROWS_BESIDE), value=99.0)
-    above_and_below = [columns[:, at : at + height] for at in range(2 * _ROWS_BESIDE + 1) if at != _ROWS_BESIDE]
-    beside = [v.roll(shift, -1) for shift in range(-_COLUMNS_BESIDE, _COLUMNS_BESIDE + 1) if shift]
-    upright, flat = (
-        torch.stack([(other - v).abs() < _SAME_WITHIN for other in others]).float().mean(0)
-        for others in (above_and_below, beside)
-    )
-    return upright * (1 - flat) * return_mask
 
 
 def _widths(config: VqvaeConfig) -> list[int]:

@@ -14,8 +14,6 @@ from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, OutputError
-from lidargrit.core.files import write_json
-from lidargrit.data.datasets.folder import SENSOR_FILE
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.scan_folder import IMAGE, TREE, KittiTree, ScanFolder, check_names, write_array
@@ -117,9 +115,7 @@ def write_completions(
                 file = files[job.index * output.count + job.turn]
                 if output.probability and job.turn == 0:
                     write_array(out / _probability_file(file), _return_share(model, job, output))
-                if not (out / SENSOR_FILE).exists():
-                    own = images.sensor if output.format == IMAGE else task.sensor_of_points(job.scan)
-                    write_json(out / SENSOR_FILE, own.to_json())
+                folder.tell_sensor(images.sensor if output.format == IMAGE else task.sensor_of_points(job.scan))
                 if output.format == IMAGE:
                     write_array(out / file, images.range_m[0])
                     kept_labels = images.label is None

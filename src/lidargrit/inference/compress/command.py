@@ -9,9 +9,7 @@ import torch
 
 from lidargrit.core import reporting
 from lidargrit.core.errors import CheckpointError, ScanError, UsageError, no_usable_scan
-from lidargrit.core.files import write_json
 from lidargrit.core.version import __version__
-from lidargrit.data.datasets.folder import SENSOR_FILE
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, projection_variant
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format, write_array
@@ -111,8 +109,7 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     with folder.writing("decompressing") as progress:
         for number in folder.missing:
             image, file = codec.decompress(archive.read(indices[number])), out / folder.files[number]
-            if not (out / SENSOR_FILE).exists():
-                write_json(out / SENSOR_FILE, codec.sensor.to_json())
+            folder.tell_sensor(codec.sensor)
             if form is None:
                 write_array(file, image.range_m)
             else:

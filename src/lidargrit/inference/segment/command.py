@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.table import Table
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, weights_sha256
 from lidargrit.data.scan_folder import KittiTree, ScanFolder, write_with_labels
@@ -108,9 +109,10 @@ class LabelScores:
         return sum(each) / len(each) if each else float("nan")
 
     def as_table(self) -> str:
-        """Return the scores as lines for a person."""
+        """Return the scores as a table for a person."""
         rows = [*self.intersection_over_union().items(), ("mean", self.mean())]
-        return "\n".join(f"{name:<16}{value:>6.3f}" for name, value in rows)
+        head = ("group", "intersection over union")
+        return Table(head, tuple((name, f"{score:.3f}") for name, score in rows)).as_text()
 
     def as_json(self) -> dict[str, Any]:
         """Return the scores and the counts as plain values."""

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lidargrit.core.table import Table
 from lidargrit.scans.fit_sensor import SensorFit
 
 _ROWS_SHOWN = 8  # spread over the sensor; the file and the picture have all
@@ -26,13 +27,19 @@ def as_table(fit: SensorFit) -> str:
         "projection": sensor.projection,
         "agreement": f"{fit.agree_share:.1%} of the points lie close to their ring's elevation",
     }
-    rows = [f"{'row':>4}{'elevation':>12}{'laser':>10}{'spread':>9}{'points':>10}    (degrees)"]
-    for row in np.unique(np.linspace(0, sensor.height - 1, _ROWS_SHOWN).round().astype(int)):
-        seen_deg = math.degrees(float(sensor.elevation_rad[row, 0]))
-        laser_deg, spread_deg = fit.laser_elevation_deg[row], fit.residual_deg[row]
-        rows.append(f"{row:>4}{seen_deg:>12.3f}{laser_deg:>10.3f}{spread_deg:>9.3f}{fit.points_per_ring[row]:>10}")
-    notes = [f"note: {warning}" for warning in fit.warnings]
-    return "\n".join([*(f"{name:<12}{fact}" for name, fact in facts.items()), "", *rows, *notes])
+    rows = [
+        (
+            f"{row}",
+            f"{math.degrees(float(sensor.elevation_rad[row, 0])):.3f}",
+            f"{fit.laser_elevation_deg[row]:.3f}",
+            f"{fit.residual_deg[row]:.3f}",
+            f"{fit.points_per_ring[row]}",
+        )
+        for row in np.unique(np.linspace(0, sensor.height - 1, _ROWS_SHOWN).round().astype(int))
+    ]
+    head = ("row", "elevation [deg]", "laser [deg]", "spread [deg]", "points")
+    above = tuple(f"{name:<12}{fact}" for name, fact in facts.items())
+    return Table(head, tuple(rows), sentences=above, notes=tuple(f"note: {each}" for each in fit.warnings)).as_text()
 
 
 def as_json(fit: SensorFit) -> dict[str, Any]:

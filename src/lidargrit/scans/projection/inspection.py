@@ -1,13 +1,12 @@
 """Losses and errors of a projection: scan, sensor → :class:`Inspection`."""
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
-from lidargrit.core.errors import one_line
+from lidargrit.core.table import Table, render
 from lidargrit.scans.projection.frame import told_height
 from lidargrit.scans.projection.pixel_coordinates import (
     PixelCoordinates,
@@ -141,38 +140,40 @@ def as_json(inspection: Inspection) -> dict[str, Any]:
 
 
 def as_table(inspection: Inspection) -> str:
-    """Return an inspection as a table of about 25 lines."""
-    return "\n".join(_lines(inspection))
-
-
-def _lines(inspection: Inspection) -> Iterator[str]:
+    """Return an inspection as tables of about 25 lines together."""
     sensor, filled, total = inspection.sensor, inspection.filled(), len(inspection.scan)
-    yield one_line(inspection.scan.source)  # a file's name may hold anything
-    yield from (f"note: {one_line(note)}" for note in inspection.scan.notes)
     stride = f", one in {sensor.column_stride} of its columns" if sensor.column_stride > 1 else ""
-    yield f"{inspection.method}, {inspection.variant}, to {sensor.height}x{sensor.width} of {sensor.name}{stride}"
-    yield from (f"problem: {problem}" for problem in inspection.problems)
+    size = f"{sensor.height}x{sensor.width} of {sensor.name}{stride}"
+    sentences = [inspection.scan.source, *(f"note: {note}" for note in inspection.scan.notes)]
+    sentences.append(f"{inspection.method}, {inspection.variant}, to {size}")
+    sentences += [f"problem: {problem}" for problem in inspection.problems]
     if inspection.rings is not None:
-        yield f"{inspection.rings} rings found, {sensor.height} rows"
-    yield f"\n{'points':<28}{total:>9}"
-    for name, count in inspection.counts().items():
-        if count or name == "kept":
-            yield f"  {FATES[name]:<26}{count:>9}{count / total:>9.2%}"
-    yield f"\n{'pixels filled':<28}{int(filled.sum()):>9}{filled.mean():>9.2%}"
-    shares = filled.mean(axis=1)
-    for which, of in zip(("top", "second", "third", "lowest"), np.array_split(shares, 4), strict=True):
-        if len(of):
-            yield f"  {which + ' quarter of the rows':<26}{'':>9}{of.mean():>9.2%}"
-    empty = np.flatnonzero(shares == 0)
-    if len(empty):
-        shown = ", ".join(map(str, empty[:12])) + (", ..." if len(empty) > 12 else "")
-        yield f"  {len(empty)} rows are empty: {shown}"
-    if inspection.errors:
-        yield f"\n{'unprojected, off by':<28}{'median':>9}{'95 %':>9}{'most':>9}"
-    for name, summary in inspection.errors.items():
-        quantity, _, unit = name.rpartition("_")
-        numbers = (summary.median, summary.percentile_95, summary.largest)
-        yield f"  {quantity + ' [' + unit + ']':<26}" + "".join(f"{number:>9.4f}" for number in numbers)
+        sentences.append(f"{inspection.rings} rings found, {sensor.height} rows")
+    counts = {name: count for name, count in inspection.counts().items() if count or name == "kept"}
+    fates = [(FATES[name], f"{count}", f"{count / total:.2%}") for name, count in counts.items()]
+    parts = zip(("top", "second", "third", "lowest"), np.array_split(filled, 4), strict=True)
+    quarters = [(f"{which} quarter of the rows", *_filling(part)) for which, part in parts if len(part)]
+    empty = np.flatnonzero(~filled.any(axis=1))
+    shown = ", ".join(map(str, empty[:12])) + (", ..." if len(empty) > 12 else "")
+    errors = [
+        (f"{name.rpartition('_')[0]} [{name.rpartition('_')[2]}]", *(f"{each:.4f}" for each in astuple(summary)))
+        for name, summary in inspection.errors.items()
+    ]
+    tables = [
+        Table(("points", f"{total}", "share"), tuple(fates), sentences=tuple(sentences)),
+        Table(
+            ("pixels filled", *_filling(filled)),
+            tuple(quarters),
+            notes=(f"{len(empty)} rows are empty: {shown}",) if len(empty) else (),
+        ),
+    ]
+    if errors:
+        tables.append(Table(("unprojected, off by", "median", "95 %", "most"), tuple(errors)))
+    return render(tables)
+
+
+def _filling(filled: Bool[np.ndarray, "h W"]) -> tuple[str, str]:
+    return f"{int(filled.sum())}", f"{filled.mean():.2%}"
 
 
 def _fates(

@@ -59,8 +59,12 @@ class Scene:
         """Return all triangles at a time, in seconds, those of kept objects too."""
         return Mesh.join([self.standing, self.objects(time_s).mesh()])
 
-    def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
-        """Return the transform from the sensor's frame to the world at a time; our car keeps to its lane."""
+    def sensor_pose(self, time_s: float = 0.0, height_m: float = SENSOR_HEIGHT_M) -> Float64[np.ndarray, "4 4"]:
+        """Return the transform from the sensor's frame to the world at a time; our car keeps to its lane.
+
+        Args:
+            height_m: height of the sensor above the road.
+        """
         here = self.plan.poses(np.array([self.speed_m_s * time_s]), np.array([self.plan.our_v_m]))
         yaw, pitch, roll = self.attitude_rad
         ahead, slope = float(here.yaw_rad[0]) + yaw, here.slope[0]
@@ -74,7 +78,7 @@ class Scene:
         up = np.cross(forward, left)
         pose = np.eye(4)
         pose[:3, :3] = np.stack((forward, left, up), axis=1)
-        pose[:3, 3] = here.xyz_m[0] + SENSOR_HEIGHT_M * up
+        pose[:3, 3] = here.xyz_m[0] + height_m * up
         return pose
 
 

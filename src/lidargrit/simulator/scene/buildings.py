@@ -204,8 +204,8 @@ def _add_wall_blocks(
     along, z = spans[:, [0, 0, 0, 0, 1, 1, 1, 1]], spans[:, [2, 3, 2, 3, 2, 3, 2, 3]]
     outer = np.broadcast_to(-np.asarray(out_m, float).reshape(-1, 1), (len(spans), 1))
     deep = np.where(np.array([1, 1, 0, 0, 1, 1, 0, 0], bool), outer, 0.02)
-    made = (np.asarray(value).reshape(-1, 1) for value in (material, albedo))
-    builder.add(blocks(_on_wall(houses, walls, which, along, deep, z)), *made, classes.BUILDING)
+    made, bright = (np.asarray(value).reshape(-1, 1) for value in (material, albedo))
+    builder.add(blocks(_on_wall(houses, walls, which, along, deep, z)), made, bright, classes.BUILDING)
 
 
 def _add_foot(

@@ -163,7 +163,9 @@ def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
         if rng.random() < (0.15 if wild else 0.75):
             along = np.arange(-95.0, 95.0, rng.uniform(18, 34)) + rng.uniform(0, 15)
             v = side * (edge + _pole_offset(rng, pavement))
-            rows.append(_beside(plan, along, v, -side * np.pi / 2, furniture.LAMP, rng.integers(furniture.VARIANTS)))
+            rows.append(
+                _beside(plan, along, v, -side * np.pi / 2, furniture.LAMP, int(rng.integers(furniture.VARIANTS)))
+            )
         along = rng.uniform(-70, 70, rng.poisson(1.5 if wild else 3.0))
         facing, v = 0.0 if side < 0 else np.pi, side * (edge + _pole_offset(rng, pavement))
         rows.append(_beside(plan, along, v, facing, furniture.SIGN, rng.integers(furniture.VARIANTS, size=len(along))))
@@ -173,7 +175,7 @@ def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
         if rng.random() < 0.25:
             first = rng.uniform(-40, 30)
             along = np.arange(first, first + rng.uniform(6, 25), 2.0)
-            variant = rng.integers(furniture.VARIANTS)
+            variant = int(rng.integers(furniture.VARIANTS))
             rows.append(_beside(plan, along, side * (edge + 0.35), 0.0, furniture.BOLLARD, variant))
     u, v, turn, kind, variant = np.concatenate(rows).T
     placements = Placements.of(u, v, turn, rise_m=plan.level_m[0])

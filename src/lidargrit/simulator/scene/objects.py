@@ -118,6 +118,6 @@ class ObjectBatch:
         return self._select(np.flatnonzero(~moves)), self._select(np.flatnonzero(moves))
 
     def _select(self, which: np.ndarray) -> "ObjectBatch":
-        shapes, albedo, label = (tuple(row[at] for at in which) for row in (self.shapes, self.albedo, self.label))
-        placements = self.placements.select(which)
+        albedo, label = (tuple(row[at] for at in which) for row in (self.albedo, self.label))
+        shapes, placements = tuple(self.shapes[at] for at in which), self.placements.select(which)
         return ObjectBatch(shapes, self.size[which], albedo, label, self.instance[which], placements, self.leans)

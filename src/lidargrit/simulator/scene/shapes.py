@@ -46,8 +46,8 @@ class MeshBuilder:
 
     def build(self) -> Mesh:
         """Return all that was added, in order."""
-        triangles_m, *finish = (np.concatenate(column) for column in zip(*self._parts, strict=True))
-        return Mesh(*finish, triangles_m)
+        triangles_m, material, albedo, label, instance = (np.concatenate(c) for c in zip(*self._parts, strict=True))
+        return Mesh(material, albedo, label, instance, triangles_m)
 
 
 class ShapeBuilder:

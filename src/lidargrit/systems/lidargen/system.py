@@ -40,6 +40,7 @@ _LEVELS_AT_MOST = 100_000
 _STEPS_AT_MOST = 100_000
 _PUBLISHED_STEP = 6.2e-6
 _NOISE_LEFT_AT_MOST = 1.5  # over the last level's; the published levels and steps leave 1.18
+_LOG2_OF_1 = 6.0  # value of log2(1 + range) that is encoded as 1: 63 m; longer ranges are encoded as that
 _NOTHING_M = 1e-4  # is added to every range, and is what a missing return is encoded as
 _WINDOWS_M = {"frd": (0.5, 63.0), "bev": (3.0, 70.0), "sensor": (0.0, math.inf)}
 
@@ -51,8 +52,6 @@ class LidarGenConfig(Settings):
     Args:
         channels: number of channels of the network's finest level.
         reflectance: whether reflectance is learned beside range; set it to false where scans have none.
-        log2_scale: value of log2(1 + range in metres) that is encoded as 1: 6 ends at 63 m, and longer ranges are
-            encoded as that. The program has 6.5 for nuScenes.
         sigma_largest: standard deviation of the noise at the first level; images have values in [0, 1].
         sigma_smallest: standard deviation of the noise at the last level.
         levels: number of noise levels, each smaller than the one before by the same factor.
@@ -61,7 +60,6 @@ class LidarGenConfig(Settings):
 
     channels: Annotated[int, Bounds(2)] = 128  # the norm compares channels
     reflectance: bool = True
-    log2_scale: Annotated[float, Bounds(above=0, most=16)] = 6.0
     sigma_largest: Positive = 50.0
     sigma_smallest: Positive = 0.01
     levels: int = 232
@@ -176,7 +174,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     @classmethod
     def from_published(cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel) -> "LidarGen":
-        """Make a generator of one checkpoint, which tells its sizes and noise levels, but not its ``log2_scale``."""
+        """Make a generator of one checkpoint, which tells its sizes and noise levels."""
         (path,) = files
         read = read_lidargen_checkpoint(path)
         if read.image_channels not in (1, 2):
@@ -186,7 +184,6 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         read_config = LidarGenConfig(
             channels=read.channels,
             reflectance=read.image_channels > 1,
-            log2_scale=config.log2_scale,
             sigma_largest=float(f"{float(read.sigmas[0]):.6g}"),
             sigma_smallest=float(f"{float(read.sigmas[-1]):.6g}"),
             levels=len(read.sigmas),
@@ -212,7 +209,7 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
 
     def _decoded(self, images: Float[Tensor, "B C H W"], sampling: LangevinSampling) -> RangeImage:
         values = images.clamp(0, 1)
-        range_m = torch.exp2(self.config.log2_scale * values[:, 0]) - 1
+        range_m = torch.exp2(_LOG2_OF_1 * values[:, 0]) - 1
         near_m, far_m = _WINDOWS_M[sampling.raydrop]
         sensor = self.sensor
         returned = (range_m > max(near_m, sensor.range_min_m)) & (range_m < min(far_m, sensor.range_max_m))
@@ -246,11 +243,11 @@ class ScoreMatching(Objective):
 
 
 def encode(images: RangeImage, config: LidarGenConfig) -> Float[Tensor, "B C H W"]:
-    """Map a batch to the network's input: log2(1 + range) over ``log2_scale`` and reflectance, both in [0, 1].
+    """Map a batch to the network's input: log2(1 + range) over 6 and reflectance, both in [0, 1].
 
     A missing return is 2.4e-5, and its reflectance 0.
     """
-    level = (torch.log2(images.range_m + _NOTHING_M + 1) / config.log2_scale).clamp(0, 1)
+    level = (torch.log2(images.range_m + _NOTHING_M + 1) / _LOG2_OF_1).clamp(0, 1)
     if not config.reflectance:
         return level[:, None]
     reflectance = reflectance_of_returns(images, "model.reflectance")

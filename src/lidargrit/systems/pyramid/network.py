@@ -19,7 +19,6 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded, RangeImage
 _HEAD_STARTS = (0.0, -1.0, -2.0, -2.0, -3.0)  # logits of the suggested ranges: mostly a pixel has that of its cell
 _LOG_SCALE_M = -3.0  # 5 cm
 _FARTHER_AT_MOST = 3.0  # from row to row of level ground; beyond, the ground is too far away to be seen
-_OWN_DISTRIBUTION = PixelSampling(range_temperature=1.0, range_noise=1.0, mask_correlation=0.0)
 
 
 def halved_sensor(sensor: SensorModel) -> SensorModel:
@@ -145,12 +144,11 @@ class Level(nn.Module):
         coarser: RangeImage | None,
         told: Float[Tensor, "B D g v"] | None,
         rngs: Sequence[torch.Generator],
-        sampling: PixelSampling | None = None,
+        sampling: PixelSampling,
     ) -> tuple[RangeImage, Float[Tensor, "B E h w"] | None]:
-        """Return one image for each random generator, by its own distribution unless settings are given; and what to
-        tell finer levels."""
+        """Return one image for each random generator, and what to tell finer levels."""
         guide, tell = self.guided(coarser, told)
-        return self.pixels.sample(guide, rngs, sampling or _OWN_DISTRIBUTION), tell
+        return self.pixels.sample(guide, rngs, sampling), tell
 
     def flops(self) -> int:
         """Return the floating-point operations of sampling one image."""

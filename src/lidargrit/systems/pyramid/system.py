@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count
+from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -45,6 +46,9 @@ class PyramidConfig(Settings):
         parent_width: number of channels of the network that each level but the coarsest has over the coarser one.
         parent_blocks: number of its residual blocks.
         finest_parent_width: number of channels of that network for the scan itself.
+        coarse_range_temperature: temperature at which coarser levels are sampled where the caller names none, as
+            ``pixels.range_temperature`` is that of the finest. Sampled at 1, they bring ranges that lie between
+            surfaces, and finer levels keep them.
     """
 
     levels: Annotated[int, Bounds(2, _LEVELS_AT_MOST)] = 6
@@ -54,6 +58,7 @@ class PyramidConfig(Settings):
     parent_width: Count = 48
     parent_blocks: Count = 4
     finest_parent_width: Count = 32
+    coarse_range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.5
 
 
 class Pyramid(Generator[PyramidConfig, PixelSampling]):
@@ -118,17 +123,14 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
         return RangeImage.cat(made)
 
     def _sampled(self, true: list[RangeImage], rngs: Sequence[torch.Generator], sampling: PixelSampling) -> RangeImage:
-        """Return scans sampled below the true images of coarse levels, the finest of them first, if there are any.
-
-        The settings are of the finest level; coarser ones follow their own distribution.
-        """
+        """Return scans sampled below the true images of coarse levels, the finest of them first, if there are any."""
         coarser, told = None, None
         for number, level in reversed(list(enumerate(levels_of(self.levels)))):
             known = number - len(self.levels) + len(true)
             if known >= 0:
                 told, coarser = level.guided(coarser, told)[1], true[known]
             else:
-                coarser, told = level.sample(coarser, told, rngs, None if number else sampling)
+                coarser, told = level.sample(coarser, told, rngs, sampling)
         assert coarser is not None
         return coarser
 
@@ -237,7 +239,13 @@ def guides_of(levels: list[Level], pyramid: list[RangeImage]) -> list[Decoded | 
 
 def _level(config: PyramidConfig, number: int, sensors: list[SensorModel]) -> Level:
     sensor, finest = sensors[number], config.pixels
-    coarse = replace(finest, surface_components=False, gravity_components=False, range_width=config.coarse_range_width)
+    coarse = replace(
+        finest,
+        surface_components=False,
+        gravity_components=False,
+        range_width=config.coarse_range_width,
+        range_temperature=config.coarse_range_temperature,
+    )
     if number == len(sensors) - 1:
         rows, columns = (size & -size for size in (sensor.height, sensor.width))  # the largest powers of 2 in them
         halvings = {"column_halvings": 0, "row_halvings": 0}

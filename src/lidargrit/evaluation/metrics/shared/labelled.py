@@ -36,7 +36,7 @@ class Labelled(FeatureExtractor[RangeImage]):
         if self.run is not None:
             return label_images(_loaded(self.run, self.device), images.with_planes(reflectance=None))
         if images.label is None:
-            raise DataError("range images without labels", "labels in both sets", "use the variant segmented")
+            raise DataError("range images without labels", "labels in both sets", "--variant segmented")
         return images
 
 
