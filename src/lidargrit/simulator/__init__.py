@@ -1,5 +1,7 @@
 """Simulated scans: a seed → a scene of triangles → the returns of a sensor in it."""
 
+import copy
+from functools import lru_cache
 from typing import get_args
 
 import numpy as np
@@ -99,18 +101,25 @@ def observe(
     check_settings(seed, theme, frame, wet)
     sensor = sensor or load_sensor("hdl64e_kitti_odometry")
     root = np.random.default_rng(seed)
-    street_rng, beam_rng = root.spawn(2)
+    beam_rng = root.spawn(2)[1]
     if frame:
         beam_rng = root.spawn(frame)[-1]
-    scene = sample_scene(street_rng, theme)
+    scene, street_rng = _street(seed, theme)
     config = ObservationConfig(FRAME_S * frame, motion, wet, kept_columns_only, model)
-    return observe_scene(scene, sensor, street_rng, beam_rng, config)
+    return observe_scene(scene, sensor, copy.deepcopy(street_rng), beam_rng, config)
+
+
+@lru_cache(maxsize=1)  # all frames of a drive have one street
+def _street(seed: int, theme: Theme) -> tuple[Scene, np.random.Generator]:
+    """Return the street of a seed, and its random stream after it was sampled."""
+    street_rng = np.random.default_rng(seed).spawn(2)[0]
+    return sample_scene(street_rng, theme), street_rng
 
 
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
     """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car."""
     check_settings(seed, theme)
-    return sample_scene(np.random.default_rng(seed).spawn(2)[0], theme)
+    return _street(seed, theme)[0]
 
 
 def frames_of(seed: int, theme: Theme = "mixed") -> int:

@@ -50,6 +50,11 @@ class Mesh(Finish):
 
     triangles_m: Float32[np.ndarray, "t 3 3"]
 
+    @cached_property
+    def kept(self) -> EmbreeTriangles:
+        """The triangles in Embree's tree, which stays as long as the mesh."""
+        return EmbreeTriangles(self.triangles_m)
+
     @classmethod
     def of(
         cls, triangles_m: Float[np.ndarray, "t 3 3"], material: int, albedo: float, label: int, instance: int = 0
@@ -84,7 +89,7 @@ class Shape:
 
     @cached_property
     def kept(self) -> EmbreeTriangles:
-        """The triangles in Embree's tree."""
+        """The triangles in Embree's tree, which stays as long as the shape."""
         return EmbreeTriangles(self.triangles_m)
 
     @cached_property

@@ -165,7 +165,9 @@ def observe_scene(
     looked, beam_noise = beams.columns(kept), beam_noise.columns(kept)
 
     elevations_rad = float(beams.elevation_rad.min()), float(beams.elevation_rad.max())
-    mesh = in_reach(scene.standing, poses, elevations_rad, sensor.range_max_m)
+    # A drive keeps the tree of all that stands over its frames; for a single scan, one of what is in reach is enough.
+    drives = config.time_s > 0
+    mesh = scene.standing if drives else in_reach(scene.standing, poses, elevations_rad, sensor.range_max_m)
     objects = objects_in_reach(scene.objects(config.time_s), poses, sensor.range_max_m)
     finish = Finish.join([mesh.finish(), objects.finish()])
     tracer, surfaces = Tracer(mesh, sensor.range_max_m, objects), Surfaces.of(finish, model, setup, config.wet)

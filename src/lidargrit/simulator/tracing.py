@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
 
-from lidargrit.simulator.embree import EmbreeTriangles
 from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.ray_windows import SortedRays, Windows
 
@@ -82,7 +81,7 @@ class Tracer:
 
     def __init__(self, mesh: Mesh, reach_m: float = float("inf"), objects: Objects | None = None) -> None:
         self._reach_m = min(reach_m, 1e30)  # Embree's own infinity is about 1e37
-        self._mesh = EmbreeTriangles(mesh.triangles_m)
+        self._mesh = mesh.kept
         self._objects = objects or Objects.none()
         self._windows: Windows | None = None
         self._first_part = (len(mesh) + self._objects.first_part()).tolist()
