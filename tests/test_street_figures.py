@@ -15,8 +15,8 @@ from lidargrit.evaluation.street_figures import (
     jumps_with_a_drop,
 )
 from lidargrit.scans.classes import BUILDING, CAR, LANE_MARKING, ROAD
-from lidargrit.scans.surface_patches import plane_residuals, row_offsets
 from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.surface_patches import plane_residuals, row_offsets
 from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")

@@ -47,11 +47,11 @@ class ToyScene:
     def objects(self, time_s=0.0):
         return Objects.none()
 
-    def sensor_pose(self, time_s=0.0):
+    def sensor_pose(self, time_s=0.0, height_m=HEIGHT_M):
         angle = self.turn_rad_s * time_s
         pose = np.eye(4)
         pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        pose[:3, 3] = self.speed_m_s * time_s, 0.0, HEIGHT_M
+        pose[:3, 3] = self.speed_m_s * time_s, 0.0, height_m
         return pose
 
 

@@ -18,6 +18,7 @@ from lidargrit.core.files import (
     write_text,
 )
 from lidargrit.core.processes import process_pool
+from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import begun_by
 from lidargrit.scans.sensors import SensorModel
@@ -71,7 +72,7 @@ class DriveConfig:
 
     def to_json(self) -> dict[str, Any]:
         """Return all that the scans depend on."""
-        return {**vars(self), "sensor": self.sensor.to_json()}
+        return {**vars(self), "sensor": self.sensor.to_json(), "streets": STREETS_VERSION}
 
 
 def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1) -> int:

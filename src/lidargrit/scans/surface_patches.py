@@ -19,6 +19,7 @@ _FEWEST = 50  # residuals of a row, whose median then has an eighth of their spr
 _LEVEL_COS = 0.98  # of the angle between level ground and the sensor: 11 degrees
 _GROUND_M = 12.0  # within which the ground tells the height: its tilt and its slope do not
 _QUARTILE = 0.25  # of noise: planes with a step in them do not count
+_DARK = 0.02  # mean reflectance of a plane below which two hundredths more or less are a matter of rounding
 _NOISE_EDGES_M = (2.0, 6.0, 10.0, 15.0, 20.0, 30.0, 40.0)
 
 
@@ -34,12 +35,14 @@ class SurfacePatches:
         residual_m: range minus the plane's range.
         row: row of each pixel.
         normal_per_m: normal of each plane, as long as one over its distance from the sensor.
+        reflectance: reflectances of the pixels; None if the image has none.
     """
 
     range_m: Float64[np.ndarray, "n 9 5"]
     residual_m: Float64[np.ndarray, "n 9 5"]
     row: Float64[np.ndarray, "n 9 5"]
     normal_per_m: Float64[np.ndarray, "n 3"]
+    reflectance: Float64[np.ndarray, "n 9 5"] | None
 
     @classmethod
     def of(cls, image: RangeImage) -> "SurfacePatches":
@@ -47,7 +50,7 @@ class SurfacePatches:
         height = image.sensor.height
         if height < _ROWS or image.sensor.width < _COLUMNS:
             nothing = np.empty((0, _ROWS, _COLUMNS))
-            return cls(nothing, nothing, nothing, np.empty((0, 3)))
+            return cls(nothing, nothing, nothing, np.empty((0, 3)), None)
         range_m = torch.where(image.return_mask, image.range_m, torch.nan).double()
         seen_m = _patches(range_m)
         near_m, far_m = seen_m.amin(dim=-1), seen_m.amax(dim=-1)  # NaN where a pixel has no return
@@ -58,8 +61,11 @@ class SurfacePatches:
         normal = torch.linalg.lstsq(directions, (1 / seen_m)[..., None]).solution
         residual_m = seen_m - 1 / (directions @ normal)[..., 0]
         plane = residual_m.square().mean(dim=-1).sqrt() <= _PLANE_M
-        seen_m, residual_m, row = (each[plane].reshape(-1, _ROWS, _COLUMNS) for each in (seen_m, residual_m, row))
-        return cls(seen_m.numpy(), residual_m.numpy(), row.numpy(), normal[plane][..., 0].numpy())
+        def kept(pixels: Tensor) -> Float64[np.ndarray, "n 9 5"]:
+            return pixels[plane].reshape(-1, _ROWS, _COLUMNS).numpy()
+
+        read = None if image.reflectance is None else kept(_patches(image.reflectance.double())[smooth])
+        return cls(kept(seen_m), kept(residual_m), kept(row), normal[plane][..., 0].numpy(), read)
 
 
 def _patches(pixels: Tensor) -> Tensor:
@@ -150,3 +156,25 @@ def height_above_ground(images: Sequence[RangeImage]) -> float | None:
         distances_m.append(1 / per_m[level])
     everywhere_m = np.concatenate(distances_m)
     return float(np.median(everywhere_m)) if len(everywhere_m) >= _FEWEST else None
+
+
+def row_readings(images: Sequence[RangeImage]) -> Float64[np.ndarray, "H"] | None:
+    """Return how much brighter each row reads a plane than the rows around it: a factor, 1 where too little is seen.
+
+    It is the median over planes of a row's mean reflectance over the whole plane's. None without reflectance.
+
+    Args:
+        images: single range images of one sensor.
+    """
+    patches = [SurfacePatches.of(image) for image in images]
+    ratios, rows = [], []
+    for each in patches:
+        if each.reflectance is None:
+            return None
+        whole = each.reflectance.mean((1, 2))
+        lit = whole > _DARK
+        ratios.append((each.reflectance[lit].mean(2) / whole[lit, None]).ravel())
+        rows.append(each.row[lit, :, 0].ravel())
+    ratio, row = np.concatenate(ratios), np.concatenate(rows)
+    of_rows = (ratio[row == at] for at in range(images[0].sensor.height))
+    return np.array([np.median(of) if len(of) >= _FEWEST else 1.0 for of in of_rows])
