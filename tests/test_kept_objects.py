@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidargrit.scans import classes
-from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.sensors import SensorSetup, load_sensor
 from lidargrit.simulator import materials, scene_of
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.mesh import Finish, Mesh, Objects, Shape
@@ -49,7 +49,7 @@ def test_hits_are_those_of_one_mesh(seed, moves):
     assert (first.triangle >= len(scene.standing)).mean() > 0.05
     finishes = scene.mesh(0.4), Finish.join([scene.standing.finish(), objects.finish()])
     (behind, light), (behind_kept, light_kept) = (
-        tracer.cast_through(*rays, tracer.cast(*rays), Surfaces.of(finish, RaydropModel()).passing())
+        tracer.cast_through(*rays, tracer.cast(*rays), Surfaces.of(finish, RaydropModel(), SensorSetup()).passing())
         for tracer, finish in zip((whole, kept), finishes, strict=True)
     )
     same(by_part(behind, len(scene.standing), objects), behind_kept)
