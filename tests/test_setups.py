@@ -40,7 +40,7 @@ def look(*parts, **setup):
         ({"glass_passes": 1.5}, "got glass_passes=1.5"),
         ({"height_m": 0.0}, "got height_m=0"),
         ({"offset_m": (0.0, 2.0)}, "got offset_m="),
-        ({"reading": ("bright",)}, "got reading="),
+        ({"reading": (0.01,)}, "got reading="),
         ({"reflectance_scale": 0.0}, "got reflectance_scale=0"),
     ],
 )

@@ -61,6 +61,7 @@ class SurfacePatches:
         normal = torch.linalg.lstsq(directions, (1 / seen_m)[..., None]).solution
         residual_m = seen_m - 1 / (directions @ normal)[..., 0]
         plane = residual_m.square().mean(dim=-1).sqrt() <= _PLANE_M
+
         def kept(pixels: Tensor) -> Float64[np.ndarray, "n 9 5"]:
             return pixels[plane].reshape(-1, _ROWS, _COLUMNS).numpy()
 
