@@ -76,7 +76,7 @@ class Shape:
 
     Args:
         triangles_m: corners; x points ahead, z up, and the foot is the origin.
-        part: which part of the object each triangle belongs to; objects of one shape have colours of their own.
+        part: index of the object's part to which each triangle belongs; every object has its own colour of each.
         material: material of each part.
     """
 

@@ -133,10 +133,10 @@ class Tracer:
         """Write nearer hits on kept objects into what was found; the nearest objects come first, and spare the rest.
 
         Args:
-            windows: which rays can meet each object.
+            windows: bounds of the rays that can meet each object.
             rays: the rays in the order of all that follows.
-            cast: where each ray starts (n, 3), where it goes (n, 3), and the range there (n).
-            found: range (n), triangle (n), and normal (n, 3) of what each met so far.
+            cast: starting point (n, 3), direction (n, 3) and range at the start (n) of each ray.
+            found: range (n), triangle (n), and normal (n, 3) of the hit of each ray so far.
         """
         start_m, directions, beyond_m = cast
         range_m, triangle, normal = found

@@ -18,9 +18,9 @@ class BodyType:
         spread: relative spread of these.
         top: share of the height of bonnet, screens and roof.
         belt: share of the height at which the side windows begin, at the nose and at the tail.
-        tumble: how far the side leans in above the belt, per metre upwards.
-        windscreen: from where to where the top is a windscreen.
-        rear_screen: the same for the rear window; an empty interval for none.
+        tumble: lean of the side above the belt, in metres inwards for each metre upwards.
+        windscreen: interval in which the top is a windscreen.
+        rear_screen: interval in which the top is a rear window; an empty one for none.
         windows: intervals of the side windows; pillars stand between them.
         seats: backs of the rows of seats.
         axles: middles of the wheels.
