@@ -73,9 +73,9 @@ class Remembering(Tracer):
         self.hits: list[Hits] = []
         self.casts = 0
 
-    def cast(self, origins_m, directions):
+    def cast(self, origins_m, directions, beyond_m=None):
         if self.casts == len(self.hits):
-            self.hits.append(super().cast(origins_m, directions))
+            self.hits.append(super().cast(origins_m, directions, beyond_m))
         hits = self.hits[self.casts]
         self.casts += 1
         return Hits(hits.range_m.copy(), hits.triangle.copy(), hits.cos_incidence.copy())

@@ -32,7 +32,7 @@ def add_gardens(
     """Line front gardens with walls and fences, and close some gaps; return the hedges."""
     lines: dict[str, list[tuple[float, float, float, float]]] = {"hedge": [], "wall": [], "fence": []}
     taste = rng.dirichlet([3.0, 1.3, 0.5])  # each street has its own
-    lined = rng.uniform(0.1, 0.8)  # and its own share of front gardens without a boundary
+    lined = rng.uniform(0.25, 0.85)  # and its own share of front gardens without a boundary
     for which, side in enumerate((-1, 1)):
         edge = plan.edge_m[which] + plan.pavement_m[which] + 0.15
         for low, high in free_spans(plan, side) if plan.setback_m[which] > 1.3 and plan.theme != "country" else []:
@@ -84,12 +84,12 @@ def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> li
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
     lots = [*_parks(rng, town), *(_woods(rng) if plan.theme == "country" else [])]
-    count = rng.poisson({"city": 65, "suburb": 110, "country": 40}[plan.theme] * green)
+    count = rng.poisson({"city": 90, "suburb": 160, "country": 60}[plan.theme] * green)
     lots.append(np.column_stack((rng.normal(0, 55, count), rng.normal(0, 45, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
     wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
-    count = rng.poisson({"city": 30, "suburb": 110, "country": 40}[plan.theme] * green)
+    count = rng.poisson({"city": 45, "suburb": 170, "country": 60}[plan.theme] * green)
     points = [np.column_stack((rng.normal(0, 35, count), rng.normal(0, 18, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
     return [*wood, make_bushes(rng, u, v, plan.level_m[1])]

@@ -20,9 +20,9 @@ _LANE_M = {"city": (2.9, 3.7), "suburb": (2.7, 3.4), "country": (2.8, 3.4)}
 _PAVEMENT_M = {"city": (2.0, 4.5), "suburb": (1.2, 2.8), "country": (0.0, 0.01)}
 _SETBACK_M = {"city": (0.0, 2.5), "suburb": (2.0, 8.5), "country": (5.0, 18.0)}
 _SIDE_STREETS = {"city": 2.4, "suburb": 2.4, "country": 0.5}  # how many on average
-_WIDE_CHANCE = {"city": 0.35, "suburb": 0.15, "country": 0.0}  # of more lanes, bays across, or a strip in between
+_WIDE_CHANCE = {"city": 0.22, "suburb": 0.1, "country": 0.0}  # of more lanes, bays across, or a strip in between
 _WIDER_M = (2.5, 9.0)
-_OPEN_CHANCE = {"city": 0.2, "suburb": 0.1, "country": 0.0}  # of a square: houses far back on one side
+_OPEN_CHANCE = {"city": 0.12, "suburb": 0.07, "country": 0.0}  # of a square: houses far back on one side
 _OPEN_M = (10.0, 45.0)
 _SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)}
 _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
@@ -245,7 +245,7 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
     """Sample roads and ground of one theme."""
     kind = str(rng.choice(["suburb", "city", "country"], p=[0.52, 0.38, 0.10])) if theme == "mixed" else theme
     lanes = 2 if kind == "country" or rng.random() < {"city": 0.8, "suburb": 0.5}[kind] else 1
-    lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.15, 1.35))
+    lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.25, 1.6))
     parked = rng.random(2) < _PARK_CHANCE[kind]
     edge = lane * lanes / 2 + np.where(parked, _PARKING_M, rng.uniform(0.15, 0.4, 2))
     close = 0.15 if kind == "suburb" and rng.random() < 0.2 else 1.0  # streets without front gardens
@@ -266,7 +266,7 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
         parked=(bool(parked[0]), bool(parked[1])),
         pavement_m=(float(pavement[0]), float(pavement[1])),
         setback_m=(float(setback[0]), float(setback[1])),
-        our_v_m=-lane / 2 + rng.normal(0, 0.12) if lanes == 2 else rng.uniform(-0.2, 0.2),
+        our_v_m=-lane / 2 * rng.uniform(0.7, 1.02) if lanes == 2 else rng.uniform(-0.2, 0.2),
         side_streets=streets,
         bridge_u_m=float(bridge),
         line=_sample_line(rng, kind),
