@@ -1,4 +1,4 @@
-"""Range images → planes through small patches of pixels: offsets of lasers, range noise, height above the ground."""
+"""Range images → planes through small patches of pixels: offsets of lasers, range noise, readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,12 +12,11 @@ from torch import Tensor
 from lidargrit.scans.types import RangeImage
 
 _ROWS, _COLUMNS = 9, 5  # of the patches: of a wall 10 m away an HDL-64E sees half a metre in so many rows
-_APART = 1.5  # farthest range over nearest of one surface: ground is seen at grazing angles
+_APART = 3.0  # farthest range over nearest of one surface: ground is struck low, by rows up to 2 degrees apart
 _PLANE_M = 0.1  # root mean square residual of what is no plane: three times the offsets of an HDL-64E
 _REACH_M = 40.0  # beyond, the ground's rows are too far apart for one plane
 _FEWEST = 50  # residuals of a row, whose median then has an eighth of their spread
-_LEVEL_COS = 0.98  # of the angle between level ground and the sensor: 11 degrees
-_GROUND_M = 12.0  # within which the ground tells the height: its tilt and its slope do not
+_COS_AT_LEAST = 0.15  # of incidence, for offsets: lower on the ground, elevations wrong by .02 degrees show
 _QUARTILE = 0.25  # of noise: planes with a step in them do not count
 _DARK = 0.02  # mean reflectance of a plane below which two hundredths more or less are a matter of rounding
 _NOISE_EDGES_M = (2.0, 6.0, 10.0, 15.0, 20.0, 30.0, 40.0)
@@ -76,14 +75,17 @@ def _patches(pixels: Tensor) -> Tensor:
 def plane_residuals(image: RangeImage) -> Float64[np.ndarray, "H"]:
     """Return the median over planes of range minus the plane's range in each row, in metres; NaN where planes are few.
 
-    A constant offset of a laser is in the residuals of all its planes, but for the part that neighbouring rows share,
+    Planes that are struck at more than 81 degrees are left out. A constant offset of a laser is in the residuals of all its planes, but for the part that neighbouring rows share,
     towards which the planes move.
 
     Args:
         image: a single range image.
     """
     found = SurfacePatches.of(image)
-    of_rows = (found.residual_m[found.row == row] for row in range(image.sensor.height))
+    # A plane's distance from the sensor over its range is the cosine of incidence.
+    steep = found.range_m.mean((1, 2)) * np.linalg.norm(found.normal_per_m, axis=1) <= 1 / _COS_AT_LEAST
+    residual_m, of_pixel = found.residual_m[steep], found.row[steep]
+    of_rows = (residual_m[of_pixel == row] for row in range(image.sensor.height))
     return np.array([np.median(of) if len(of) >= _FEWEST else np.nan for of in of_rows])
 
 
@@ -142,21 +144,6 @@ def range_noise(images: Sequence[RangeImage]) -> tuple[float, float] | None:
     terms = np.stack((np.ones_like(squared_m2), squared_m2), axis=1) / variance_m2[:, None]
     constant, growth = np.linalg.lstsq(terms, np.ones_like(squared_m2))[0].clip(0)
     return float(np.sqrt(constant)), float(np.sqrt(growth))
-
-
-def height_above_ground(images: Sequence[RangeImage]) -> float | None:
-    """Return the height of the sensor above the ground around it, in metres; None if too little level ground is seen.
-
-    It is the median distance of the planes within 12 m that lie below the sensor and are level to 11 degrees.
-    """
-    distances_m = []
-    for image in images:
-        found = SurfacePatches.of(image)
-        per_m = np.linalg.norm(found.normal_per_m, axis=1)
-        level = (-found.normal_per_m[:, 2] > _LEVEL_COS * per_m) & (found.range_m.max((1, 2), initial=0) < _GROUND_M)
-        distances_m.append(1 / per_m[level])
-    everywhere_m = np.concatenate(distances_m)
-    return float(np.median(everywhere_m)) if len(everywhere_m) >= _FEWEST else None
 
 
 def row_readings(images: Sequence[RangeImage]) -> Float64[np.ndarray, "H"] | None:

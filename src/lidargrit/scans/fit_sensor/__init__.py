@@ -163,7 +163,8 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     steps = firing_steps_deg(used, row_of_point)
     columns = columns_of_scans(used, row_of_point, steps)
     sensor = _model(name, rows, columns, used, row_of_point, rings, len(used))
-    sensor = replace(sensor, setup=fit_setup([scans[index] for index in rings.used], sensor))
+    setup, assumed = fit_setup([scans[index] for index in rings.used], sensor)
+    sensor = replace(sensor, setup=setup)
     return SensorFit(
         sensor=sensor,
         method=rings.method,
@@ -180,7 +181,12 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=(*_notes_of(scans), *notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns)),
+        warnings=(
+            *_notes_of(scans),
+            *notes_on_sensor(rows, rings),
+            *_warnings(rows, rings, len(scans), columns),
+            *assumed,
+        ),
     )
 
 
