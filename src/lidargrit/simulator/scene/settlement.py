@@ -13,10 +13,10 @@ from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
 _LENGTH_M = {"city": (8.0, 20.0), "suburb": (7.5, 14.0), "country": (9.0, 18.0)}
 _DEPTH_M = {"city": (9.0, 13.0), "suburb": (7.5, 11.0), "country": (8.0, 14.0)}
 _STOREYS = {"city": (2, 6), "suburb": (1, 4), "country": (1, 3)}
-_GAP_CHANCE = {"city": 0.26, "suburb": 0.72, "country": 1.0}
-_GAP_M = {"city": (2.5, 9.0), "suburb": (2.5, 11.0), "country": (10.0, 90.0)}
+_GAP_CHANCE = {"city": 0.22, "suburb": 0.65, "country": 1.0}
+_GAP_M = {"city": (2.5, 9.0), "suburb": (2.5, 9.0), "country": (10.0, 90.0)}
 _BEHIND = {"city": 0.85, "suburb": 0.8, "country": 0.1}  # share of the places behind the rows that are built on
-_PARK_CHANCE = {"city": 0.09, "suburb": 0.15, "country": 0.3}
+_PARK_CHANCE = {"city": 0.07, "suburb": 0.13, "country": 0.3}
 _LATTICE_M = 24.0
 
 

@@ -15,14 +15,14 @@ from lidargrit.simulator.scene.shapes import blocks
 Theme = Literal["city", "suburb", "country", "mixed"]
 EXTENT_M = 125.0  # a little more than the 120 m that the sensor sees
 _PARKING_M = 2.1  # width of a parked row
-_PARK_CHANCE = {"city": (0.55, 0.6), "suburb": (0.35, 0.45), "country": (0.0, 0.0)}  # right, left
+_PARK_CHANCE = {"city": (0.65, 0.65), "suburb": (0.5, 0.5), "country": (0.0, 0.0)}  # right, left
 _LANE_M = {"city": (2.9, 3.7), "suburb": (2.7, 3.4), "country": (2.8, 3.4)}
 _PAVEMENT_M = {"city": (2.0, 4.5), "suburb": (1.2, 2.8), "country": (0.0, 0.01)}
-_SETBACK_M = {"city": (0.0, 2.5), "suburb": (2.0, 8.5), "country": (5.0, 18.0)}
+_SETBACK_M = {"city": (0.0, 2.5), "suburb": (1.5, 6.5), "country": (5.0, 18.0)}
 _SIDE_STREETS = {"city": 2.4, "suburb": 2.4, "country": 0.5}  # how many on average
-_WIDE_CHANCE = {"city": 0.22, "suburb": 0.1, "country": 0.0}  # of more lanes, bays across, or a strip in between
+_WIDE_CHANCE = {"city": 0.15, "suburb": 0.06, "country": 0.0}  # of more lanes, bays across, or a strip in between
 _WIDER_M = (2.5, 9.0)
-_OPEN_CHANCE = {"city": 0.12, "suburb": 0.07, "country": 0.0}  # of a square: houses far back on one side
+_OPEN_CHANCE = {"city": 0.08, "suburb": 0.05, "country": 0.0}  # of a square: houses far back on one side
 _OPEN_M = (10.0, 45.0)
 _SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)}
 _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
@@ -271,7 +271,7 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
         bridge_u_m=float(bridge),
         line=_sample_line(rng, kind),
         waves=_sample_waves(rng),
-        tilt=rng.normal(0, 0.02, 2),
+        tilt=rng.normal(0, 0.016, 2),
         camber=rng.uniform(0.005, 0.035),
         banks_m=(rng.normal(0.2, 1.0), rng.normal(0.2, 1.0)) if wild else (0.0, 0.0),
         level_m=(0.0, -0.03) if wild else (rng.uniform(0.06, 0.15), rng.uniform(0.1, 0.25)),
@@ -306,8 +306,8 @@ def _sample_line(rng: np.random.Generator, kind: str) -> np.ndarray:
 
 
 def _sample_waves(rng: np.random.Generator) -> np.ndarray:
-    """Sample waves of the ground whose slopes have a spread of about one in fifty each."""
+    """Sample waves of the ground whose slopes have a spread of about one in sixty each."""
     length, turn = np.exp(rng.uniform(np.log(45), np.log(260), 4)), rng.uniform(0, 2 * np.pi, 4)
     number = 2 * np.pi / length
-    amplitude = rng.normal(0, 0.02, 4) / number
+    amplitude = rng.normal(0, 0.016, 4) / number
     return np.column_stack((amplitude, number * np.cos(turn), number * np.sin(turn), rng.uniform(0, 2 * np.pi, 4)))
