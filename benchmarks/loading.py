@@ -19,8 +19,8 @@ from lidargrit.core.files import write_json, write_text
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.plan import ARRAYS, PLAN_FILE, SCANS_FILE
+from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.data.prepared.workers import ShardWriter
 from lidargrit.scans.sensors import load_sensor
