@@ -7,7 +7,7 @@ cd "$(dirname "$0")/.."
 folder=${1:-wheels}
 python=$([ -x .venv/bin/python ] && echo .venv/bin/python || echo python3)
 
-# What lidargrit imports beyond torch, NumPy, SciPy, safetensors, jaxtyping, rich, matplotlib, Pillow and fsspec.
+# What lidargrit imports beyond torch, NumPy, SciPy, safetensors, jaxtyping, rich, matplotlib and Pillow.
 packages=(embreex lightning-fabric)
 platforms=()
 for glibc in 2_28 2_27 2_17; do platforms+=(--platform "manylinux_${glibc}_x86_64"); done

@@ -19,9 +19,10 @@ from lidargrit.core.files import write_json, write_text
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.plan import ARRAYS, PLAN_FILE, SCANS_FILE
 from lidargrit.data.prepared.prepare import prepare
-from lidargrit.data.prepared.prepared import PLAN_FILE, SCANS_FILE, PreparedImages, shard_name
-from lidargrit.data.prepared.shards import ShardWriter
+from lidargrit.data.prepared.prepared import PreparedImages
+from lidargrit.data.prepared.workers import ShardWriter
 from lidargrit.scans.sensors import load_sensor
 
 
@@ -39,7 +40,7 @@ def main() -> None:
         few = prepare(options.source, config, Path(folder) / "few", sensor=sensor)
         print(f"projected {len(PreparedImages(str(few)))} scans in {time.perf_counter() - begun:.1f} s")
         many = repeat(few, Path(folder) / "many", options.images)
-        size = sum(path.stat().st_size for path in many.glob("*.shard")) / options.images
+        size = sum(path.stat().st_size for path in (many / ARRAYS).glob("*/c.*")) / options.images
         print(f"{options.images} images of {sensor.height}x{sensor.width}, {size / 1e3:.1f} KB each")
         before = own_mb()
         begun = time.perf_counter()
@@ -64,11 +65,13 @@ def repeat(few: Path, many: Path, count: int) -> Path:
     write_text(many / SCANS_FILE, json.dumps([[f"image {index}", "", 0, 0] for index in range(count)]))
     write_json(many / PLAN_FILE, asdict(spec))
     images = [RangeImages(store.sensor, [store]).batch([index])[0] for index in range(len(store))]
+    begun = time.process_time()
     for shard in range(spec.num_shards):
-        writer = ShardWriter(spec.range_step_m)
+        writer = ShardWriter(many, spec, shard)
         for index in spec.scans_of(shard):
             writer.add(index, images[index % len(images)])
-        writer.write(many / shard_name(shard))
+        writer.keep()
+    print(f"written in {(time.process_time() - begun) / count * 1e3:.2f} ms of processor time an image")
     return many
 
 

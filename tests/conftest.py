@@ -1,5 +1,6 @@
 """What tests share: where the reference numbers and the real scans lie, if they lie beside the project."""
 
+import compileall
 import functools
 import inspect
 import itertools
@@ -15,6 +16,7 @@ import pytest
 import torch
 from hypothesis import settings
 
+import lidargrit
 from browser import CHROMIUM, Browser
 from lidargrit.core import reporting
 
@@ -23,7 +25,9 @@ SHARED = Path(os.environ.get("LIDARGRIT_SHARED", Path(__file__).resolve().parent
 # How long an example takes says nothing: other tests run beside it.
 settings.register_profile("unhurried", deadline=None)
 settings.load_profile("unhurried")
-# Commands that tests kill, or let run out of disk, would leave cut bytecode behind for all that follow.
+# Commands that tests kill, or let run out of disk, would leave cut bytecode behind for all that follow: they find it
+# made, which spares each of the many child processes half a second, and write none.
+compileall.compile_dir(Path(lidargrit.__file__).parent, quiet=2)
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 torch.set_num_threads(1)  # two threads while another process runs can be many times slower
 

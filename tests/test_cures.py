@@ -39,7 +39,7 @@ CHEAP = ("export", "fit-sensor", "inspect", "prepare", "rescan", "view")  # whos
 
 
 def points(sensor: str, seed: int = 0) -> np.ndarray:
-    scan = simulate(seed=seed, sensor=load_sensor(sensor))
+    scan = simulate(seed=seed, sensor=load_sensor(sensor).with_columns(900))
     assert scan.reflectance is not None
     return np.concatenate([scan.points_xyz_m.numpy(), scan.reflectance.numpy()[:, None]], 1).astype("<f4")
 

@@ -11,7 +11,7 @@ from lidargrit.core.errors import CheckpointError
 from lidargrit.nn.flops import flops_of
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.dusty.dcgan import Discriminator, Synthesis, Widths
-from lidargrit.systems.dusty.system import AdversarialObjective, Dusty, DustyConfig, load_published
+from lidargrit.systems.dusty.system import AdversarialObjective, Dusty, DustyConfig
 from reference_weights import seeded_weights
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
@@ -116,7 +116,7 @@ def test_published_weights_draw_what_a_slow_network_draws(logits, tmp_path):
         "optim_G": {"state": {0: {"step": 3}}, "param_groups": []},
     }
     torch.save(other, tmp_path / "checkpoint.pth")
-    generator = load_published(tmp_path / "checkpoint.pth")
+    generator = Dusty.from_published([tmp_path / "checkpoint.pth"], DustyConfig(), load_sensor("hdl64e_kitti_odometry"))
     assert generator.config.variant == ("baseline", "dusty_1", "dusty_2")[logits]
     latents = torch.randn(1, 6, generator=torch.Generator().manual_seed(3))
     with torch.no_grad():
@@ -163,8 +163,8 @@ def test_a_synthesis_wraps_around_the_circle():
     [
         ({"G": {}}, "which holds no 'G_ema'"),
         ({"G_ema": {"0.0.module.weight": torch.zeros(3)}}, "whose 'G_ema' is no generator of DUSty v1"),
-        ({"G_ema": published(1)}, r"of another configuration \('synthesis.project.weight'"),  # of smaller images
-        ({"G_ema": {**published(1, (64, 256)), "more": torch.zeros(1)}}, "has besides 'synthesis.more'"),
+        ({"G_ema": published(1)}, r"of another configuration \('project.weight'"),  # of smaller images
+        ({"G_ema": {**published(1, (64, 256)), "more": torch.zeros(1)}}, "has besides 'more'"),
         ({"G_ema": {"a": torch.zeros(1, dtype=torch.float64)}}, "no float32 tensor"),
         ({"G_ema": [1, 2]}, "which holds no tensors by name"),
     ],
@@ -172,7 +172,7 @@ def test_a_synthesis_wraps_around_the_circle():
 def test_other_checkpoints_are_refused_in_one_line(content, match, tmp_path):
     torch.save(content, tmp_path / "checkpoint.pth")
     with pytest.raises(CheckpointError, match=match) as refusal:
-        load_published(tmp_path / "checkpoint.pth")
+        Dusty.from_published([tmp_path / "checkpoint.pth"], DustyConfig(), load_sensor("hdl64e_kitti_odometry"))
     assert "\n" not in str(refusal.value)
 
 
@@ -180,4 +180,4 @@ def test_what_is_no_checkpoint_is_refused(tmp_path):
     (tmp_path / "words").write_text("no weights")
     for path in (tmp_path / "words", tmp_path, tmp_path / "nowhere"):
         with pytest.raises(CheckpointError, match=r"wanted a checkpoint with weights at 'G_ema'"):
-            load_published(path)
+            Dusty.from_published([path], DustyConfig(), load_sensor("hdl64e_kitti_odometry"))

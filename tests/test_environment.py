@@ -56,10 +56,10 @@ def test_commands_keep_scans_in_the_home_of_the_user_and_find_them_there(monkeyp
     monkeypatch.setenv("LIDARGRIT_CACHE", "~/x")
     words = ["data.train=simulated:1:train", "data.val=simulated:1:val", "data.workers=1", "data.columns=64"]
     assert main(["train", "marginal", "run", "--set", *words]) == 0
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "home" / "x").glob("*/*.shard")}
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "home" / "x").glob("*/made/*.json")}
     assert len(kept) == 2
     assert main(["train", "memorised", "again", "--set", *words]) == 0
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "home" / "x").glob("*/*.shard")} == kept
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "home" / "x").glob("*/made/*.json")} == kept
     assert main(["doctor"]) == 0
     assert str(tmp_path / "home" / "x") in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"home", "run", "again"}, "no folder called ~"

@@ -132,7 +132,7 @@ pytestmark = pytest.mark.parametrize("name", NAMES)
 def test_a_seed_gives_the_same_scan_bit_for_bit_whatever_the_batch(name):
     generator, sampling = made(name)
     seeds, together = list(range(3, 14)), sampled_together(name)
-    for index in (0, 7, 8, 10):  # first and last of the first batch and of the rest
+    for index in (0, 7):  # first and last of the first batch; below, each scan has another place in another batch
         assert same(scans_of(generator, [seeds[index]], sampling), together[index : index + 1]), seeds[index]
     assert same(scans_of(generator, seeds[::-1], sampling), RangeImage.stack([together[i] for i in range(10, -1, -1)]))
     assert torch.equal(together.range_m[0], together.range_m[1]) != generator.is_random
@@ -144,8 +144,8 @@ def test_threads_and_inference_mode_change_no_scan(name):
     with torch.inference_mode():
         assert same(scans_of(generator, [3], sampling), together[:1])
     with ThreadPoolExecutor(2) as pool:
-        found = list(pool.map(lambda seed: scans_of(generator, [seed], sampling), range(3, 7)))
-    assert same(RangeImage.cat(found), together[:4])
+        found = list(pool.map(lambda seed: scans_of(generator, [seed], sampling), range(3, 5)))
+    assert same(RangeImage.cat(found), together[:2])
 
 
 def test_streams_the_same_scans_without_end(name):

@@ -181,7 +181,7 @@ def test_files_in_another_order_or_number_or_of_another_system_are_refused(files
     assert "none.pth, which is no file" in error(PRESET, out, tmp_path / "none.pth", files[1])
     torch.save(r2dm_checkpoint(), tmp_path / "r2dm.pth")
     other = error("r2dm_kitti_360", out, tmp_path / "r2dm.pth", "--set", "data.columns=512")
-    assert re.search(r"'network\.coords' is \(.*1024\)\); wanted \(.*512\)", other)
+    assert re.search(r"'coords' is \(.*1024\)\); wanted \(.*512\)", other)
     assert not out.exists()
 
 

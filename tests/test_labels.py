@@ -11,6 +11,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.plan import pixels_name
 from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.data.scan_folder import KittiTree
@@ -80,10 +81,10 @@ def test_a_pixel_has_the_class_of_its_point_through_projection_and_preparation(f
     store = PreparedImages(str(folder))
     pixels = store.read(0, verify=True)
     assert np.array_equal(pixels.planes["label"], image.label.numpy())
-    shard = folder / "000000.shard"
-    content = bytearray(shard.read_bytes())
-    content[store._entries[0][1].end - 1] ^= 255  # the last byte of the first image, of its classes
-    shard.write_bytes(content)
+    labels = folder / pixels_name("label", 0)
+    content = bytearray(labels.read_bytes())
+    content[30] ^= 255
+    labels.write_bytes(content)
     assert damaged_shards(folder) == [0]
 
 

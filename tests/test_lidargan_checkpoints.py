@@ -45,7 +45,7 @@ def test_a_checkpoint_of_the_program_becomes_a_run(cls, preset, tmp_path):
     ("cls", "change", "message"),
     [
         (LidarGan, lambda c: c.pop("main.12.weight"), "holds no generator of LidarGAN"),
-        (LidarGan, lambda c: c.update({"main.12.weight": torch.ones(2, 3, 4, 4)}), "generates 3 coordinates"),
+        (LidarGan, lambda c: c.update({"main.12.weight": torch.ones(2, 3, 4, 4)}), "whose images have 3 coordinates"),
         (
             LidarGan,
             lambda c: c.update({"main.0.weight": torch.ones(5, 16, 2, 32)}),
@@ -53,7 +53,11 @@ def test_a_checkpoint_of_the_program_becomes_a_run(cls, preset, tmp_path):
         ),
         (LidarGan, lambda c: c.pop("main.1.bias"), r"lacks 'main\.1\.bias'"),
         (LidarVae, lambda c: c.pop("encode.main.0.weight"), "holds no autoencoder"),
-        (LidarVae, lambda c: c.update({"encode.main.0.weight": torch.ones(2, 3, 4, 4)}), "encodes 3 coordinates"),
+        (
+            LidarVae,
+            lambda c: c.update({"encode.main.0.weight": torch.ones(2, 3, 4, 4)}),
+            "whose images have 3 coordinates",
+        ),
         (LidarVae, lambda c: c.update({"more": torch.ones(1)}), "has besides 'more'"),
         (LidarVae, lambda c: c.update({"encode.out.weight": torch.ones(1).half()}), "is no float32 tensor"),
     ],

@@ -360,8 +360,8 @@ def test_a_checkpoint_of_the_program_becomes_a_run(image_channels, tmp_path):
         (lambda c: c[0].update({"module.sigmas": torch.ones(3)}), "are no falling noise levels"),
         (lambda c: c[0].update({"module.sigmas": torch.tensor([3.0, 2.0, 1.0])}), "do not fall by one factor"),
         (lambda c: c[4].pop("begin_conv.weight"), r"holds no convolution 'begin_conv\.weight'"),
-        (lambda c: c[4].pop("res1.0.conv1.bias"), r"lacks 'network\.res1\.0\.conv1\.bias'"),
-        (lambda c: c[4].update({"more": torch.ones(1)}), r"has besides 'network\.more'"),
+        (lambda c: c[4].pop("res1.0.conv1.bias"), r"lacks 'res1\.0\.conv1\.bias'"),
+        (lambda c: c[4].update({"more": torch.ones(1)}), r"has besides 'more'"),
         (lambda c: c[4].update({"normalizer.beta": torch.ones(4).half()}), r"'normalizer\.beta' is no float32 tensor"),
         (
             lambda c: c[4].update({"begin_conv.weight": torch.ones(1 << 16, 4, 3, 3)}),

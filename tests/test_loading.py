@@ -1,24 +1,25 @@
 """Prepared range images: pixels of projecting, found again, never stale, never half, whoever made which part."""
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 import threading
 from dataclasses import replace
+from pathlib import Path
 
-import fsspec
 import numpy as np
 import pytest
 import torch
-from fsspec.implementations.local import LocalFileSystem
 
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
 from lidargrit.data.batches import Batches
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.images import Provenance, RangeImages
-from lidargrit.data.prepared import shards, workers
+from lidargrit.data.prepared import workers
+from lidargrit.data.prepared.arrays import range_step_m
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepare import prepare as prepare_function
@@ -91,8 +92,8 @@ def test_prepared_pixels_are_those_of_projecting_to_a_millimetre(tree):
 def test_steps_are_2_mm_as_far_as_16_bits_reach(reach_m, step_m):
 
     sensor = replace(load_sensor("hdl64e_kitti_360"), range_max_m=reach_m)
-    assert shards.range_step_m(sensor) == pytest.approx(step_m)
-    assert reach_m / shards.range_step_m(sensor) <= 65535
+    assert range_step_m(sensor) == pytest.approx(step_m)
+    assert reach_m / range_step_m(sensor) <= 65535
 
 
 def test_an_image_takes_at_most_160_kilobytes(real):
@@ -102,8 +103,8 @@ def test_an_image_takes_at_most_160_kilobytes(real):
     )
     store = images._stores[0]
     assert isinstance(store, PreparedImages)
-    sizes = [entry.range_bytes + entry.reflectance_bytes for _, entry in store._entries]
-    assert 0 < max(sizes) < 160_000
+    size = sum(path.stat().st_size for path in Path(store._folder.location, "images.zarr").glob("*/c.*"))
+    assert 0 < size / 4 < 160_000
 
 
 def test_the_cache_is_used_and_knows_when_it_is_stale(tree, monkeypatch):
@@ -145,7 +146,7 @@ def test_a_failed_projection_leaves_nothing_that_looks_whole(tree, cache, heard)
     bad.write_bytes(b"")
     with pytest.raises(ScanError, match=r"leave such scans out by --bad-scans skip"):
         load(tree)
-    assert not list(cache.rglob("*.shard"))
+    assert not list(cache.rglob("c.*"))
     config = DataConfig(bad_scans="skip")
     images = load_range_images((str(tree),), config)
     assert len(images) == 4
@@ -172,7 +173,7 @@ def test_a_sensor_with_fewer_lasers_than_the_scans_show_is_warned_of(tree, heard
 def test_processes_make_the_same_shards_and_count_every_scan(tree, tmp_path, small_shards):
     alone = prepare(str(tree), SIMULATED, tmp_path / "alone")
     together = prepare(str(tree), DataConfig(workers=2), tmp_path / "together")
-    names, theirs = (sorted(path.name for path in folder.glob("*.shard")) for folder in (alone, together))
+    names, theirs = (sorted(path.name for path in folder.glob("images.zarr/range/c.*")) for folder in (alone, together))
     assert len(names) == 3, "of which one process makes two"
     assert names == theirs
     assert same(alone, together)
@@ -231,7 +232,9 @@ sys.exit(os.waitpid(begun(), 0)[1] != 0 or not killed)
 def test_killed_at_any_moment_it_goes_on_and_ends_the_same(tmp_path, small_shards):
     subprocess.run([sys.executable, "-c", KILLED_AND_FINISHED, str(tmp_path / "killed")], check=True)
     prepare("simulated:12", SIMULATED, tmp_path / "whole")
-    assert len(list((tmp_path / "whole").glob("*.shard"))) == 6
+    assert len(list((tmp_path / "whole").glob("images.zarr/range/c.*"))) == 6
+    names = [sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) for folder in tmp_path.iterdir()]
+    assert names[0] == names[1], "nothing half-written is left"
     assert same(tmp_path / "killed", tmp_path / "whole")
 
 
@@ -254,28 +257,14 @@ def test_a_shard_is_taken_up_where_a_process_was_stopped(tree, tmp_path, monkeyp
     monkeypatch.setattr(workers, "project", StopsAfter(3))
     with pytest.raises(KeyboardInterrupt):
         prepare(str(tree), SIMULATED, folder)
-    assert sorted(path.name for path in folder.glob("0*")) == ["000000.unfinished"]
+    assert len(json.loads((folder / "made" / "000000.json").read_text())["images"]) == 3
     monkeypatch.setattr(workers, "project", rest := StopsAfter(5))
     prepare(str(tree), SIMULATED, folder)
     assert rest.asked == 2, "only the scans that were not done"
     monkeypatch.setattr(workers, "project", project)
     assert same(folder, prepare(str(tree), SIMULATED, tmp_path / "whole"))
-    assert sorted(path.name for path in folder.iterdir()) == ["000000.shard", "plan.json", "scans.json"]
-
-
-def test_prepared_images_are_a_source_here_and_by_url(tree, tmp_path):
-    folder = prepare(str(tree), SIMULATED, tmp_path / "out")
-    here = load_range_images((str(folder),), SIMULATED)
-    memory = fsspec.filesystem("memory")
-    memory.put(str(folder), "/bucket/scans", recursive=True)
-    away = load_range_images(("memory://bucket/scans",), SIMULATED)
-    assert torch.equal(here.batch([3, 0]).range_m, away.batch([3, 0]).range_m)
-    with pytest.raises(DataError, match=r"prepared for 'hdl64e_kitti_odometry' \(64x2048\); wanted the rays of"):
-        load_range_images((str(folder),), DataConfig(sensor="hdl64e_kitti_360"))
-    with pytest.raises(DataError, match=r"memory://bucket/nothing/plan.json, which does not exist"):
-        load_range_images(("memory://bucket/nothing",), SIMULATED)
-    with pytest.raises(DataError, match="a URL that fsspec can open"):
-        load_range_images(("gopher://somewhere",), SIMULATED)
+    assert sorted(path.name for path in folder.iterdir()) == ["images.zarr", "made", "plan.json", "scans.json"]
+    assert [path.name for path in (folder / "made").iterdir()] == ["000000.json"]
 
 
 def test_images_of_more_columns_serve_fewer_as_a_projection_would(tree, tmp_path):
@@ -301,37 +290,6 @@ def test_images_of_more_columns_serve_fewer_as_a_projection_would(tree, tmp_path
     rounded = prepare(str(tree), DataConfig(workers=1, projection_variant="reference"), tmp_path / "rounded")
     with pytest.raises(DataError, match="prepared for"):
         set_of(rounded, 512, projection_variant="reference")
-
-
-class Bucket(LocalFileSystem):
-    """A store as the libraries of stores are: a version comes before the range of bytes, and errors are their own."""
-
-    protocol = "bucket"
-    down = False
-
-    def info(self, path, **options):
-        if Bucket.down:
-            raise RuntimeError("no credentials")
-        return super().info(path, **options)
-
-    def cat_file(self, path, version_id=None, start=None, end=None):
-        if Bucket.down:
-            raise RuntimeError("connection lost")
-        return super().cat_file(path, start, end)
-
-
-def test_prepared_images_are_read_from_a_bucket(tree, tmp_path, monkeypatch):
-    fsspec.register_implementation("bucket", Bucket, clobber=True)
-    folder = prepare(str(tree), SIMULATED, tmp_path / "out")
-    images = load_range_images((f"bucket://{folder}",), SIMULATED)
-    assert torch.equal(images.batch([3, 0]).range_m, load_range_images((str(folder),), SIMULATED).batch([3, 0]).range_m)
-    monkeypatch.setattr(Bucket, "down", True)
-    with pytest.raises(
-        DataError, match=r"000000.shard, which cannot be read \(RuntimeError: connection lost\); wanted a"
-    ):
-        images.batch([1])
-    with pytest.raises(DataError, match=r"^got \S*plan.json, which cannot be read \(RuntimeError: no credentials\)"):
-        load_range_images((f"bucket://{folder}",), SIMULATED)
 
 
 def test_batches_come_in_one_order_whatever_reads_them(tree):

@@ -13,6 +13,7 @@ import torch
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, UnknownNameError
 from lidargrit.evaluation.metrics import Metric, load_metric
+from lidargrit.evaluation.metrics.shared import clouds
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
 from lidargrit.evaluation.metrics.shared.labelled import LabelMetric
 from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork
@@ -34,25 +35,38 @@ pytestmark = [pytest.mark.parametrize(("name", "variant"), CASES)]
 def _network(name, monkeypatch):
     """Give metrics that look through a network random weights for it, and small images, since it takes its time.
 
-    Images are looked at one by one, so that an image that was seen before need not be looked at again.
+    What is found in an image alone, by a network or by sampling far points, is not looked for again in another test.
     """
+    monkeypatch.setattr(clouds, "sampled_clouds", sampled_once)
     if issubclass(load_metric(name), LabelMetric):
         monkeypatch.setattr(sys.modules[LabelMetric.__module__], "segmenter_of", lambda sensor, named: None)
     elif load_metric(name).needs_weights:
         monkeypatch.setenv("LIDARGRIT_WEIGHTS", str(weights_folder()))
-        monkeypatch.setattr(PretrainedNetwork, "_forward", seen_once)
+        monkeypatch.setattr(PretrainedNetwork, "features", seen_once)
         monkeypatch.setattr(sys.modules[__name__], "SENSOR", SMALL)
 
 
-FORWARD, SEEN = PretrainedNetwork._forward, {}
+FOUND: dict[tuple[str, bytes], np.ndarray] = {}
 
 
-def seen_once(network, image):
-    """Return the features of an image, from the second time on without the network."""
-    key = network.name, image.numpy().tobytes()
-    if key not in SEEN:
-        SEEN[key] = FORWARD(network, image)
-    return SEEN[key]
+def found_once(kind, images, find):
+    """Return what is found in each of some images, looking only at those that were not seen before, all at once."""
+    keys = [(kind, np.asarray(image).tobytes()) for image in images]
+    new = {key: at for at, key in enumerate(keys) if key not in FOUND}
+    if new:
+        FOUND.update(zip(new, find(images[[*new.values()]]), strict=True))
+    return np.stack([FOUND[key] for key in keys])
+
+
+def seen_once(network, images):
+    return found_once(network.name, images.float(), network._forward)
+
+
+SAMPLED = clouds.sampled_clouds
+
+
+def sampled_once(points, variant):
+    return found_once(variant, points, lambda some: SAMPLED(some, variant))
 
 
 def scenes(seed, count=10, walls=6, drop_share=0.1, noise_m=0.0):

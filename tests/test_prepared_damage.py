@@ -9,16 +9,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from google_crc32c import value as crc32c
 
 from lidargrit.core.errors import DataError, OutputError, ScanError
 from lidargrit.core.files import claim_folder
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
+from lidargrit.data.prepared.arrays import ImageArrays
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.plan import made_name, pixels_name
 from lidargrit.data.prepared.prepare import damaged_shards, prepare
 from lidargrit.data.prepared.prepared import PreparedImages
-from lidargrit.data.prepared.shards import LocalBytes
+from lidargrit.data.prepared.workers import ShardWriter
+from lidargrit.scans.types import RangeImage
 
 prepare_module = sys.modules[prepare.__module__]
+MADE, RANGES = made_name(0), pixels_name("range", 0)
 CONFIG = DataConfig(workers=1, columns=512, column_stride=8)
 
 
@@ -43,70 +49,111 @@ def pixels_of(folder):
 
 
 @pytest.mark.parametrize("damage", [b"", b"noise" * 99])
-def test_a_damaged_unfinished_shard_is_made_anew(folder, damage):
-    (folder / "000000.shard").unlink()
-    (folder / "000000.unfinished").write_bytes(damage)
+def test_a_shard_whose_facts_are_damaged_is_made_anew(folder, damage):
+    good = pixels_of(folder)
+    (folder / MADE).write_bytes(damage)
+    (folder / RANGES).write_bytes(damage)
     prepare("simulated:1", CONFIG, folder)
-    assert len(PreparedImages(str(folder))) == 1
+    assert np.array_equal(pixels_of(folder)[0].range_m, good[0].range_m)
     assert damaged_shards(folder) == []
-    assert not (folder / "000000.unfinished").exists()
 
 
 def test_damage_is_found_and_made_good(tmp_path, small_shards):
     folder = prepare("simulated:6", CONFIG, tmp_path / "out")
     good = pixels_of(folder)
-    second = folder / "000001.shard"
+    second = folder / pixels_name("range", 1)
     content = bytearray(second.read_bytes())
     content[5000] ^= 255  # within the compressed pixels
     second.write_bytes(content)
     assert damaged_shards(folder) == [1]
-    for damage in (b"", content[:-1], content[: len(content) // 2], b"noise" * 99):
-        second.write_bytes(damage)
-        with pytest.raises(DataError, match=r"000001.shard"):
-            PreparedImages(str(folder))
+    for damage in (b"", content[:-1], content[: len(content) // 2], b"noise" * 99, None):
+        second.unlink() if damage is None else second.write_bytes(damage)
+        with pytest.raises(DataError, match=r"images.zarr, damaged .*; prepare it again with --verify"):
+            pixels_of(folder)
         prepare("simulated:6", CONFIG, folder)
         assert all(np.array_equal(one[0], other[0]) for one, other in zip(pixels_of(folder), good, strict=True))
-    shutil.copy(folder / "000000.shard", second)  # whole, but of other scans
+    shutil.copy(folder / made_name(0), folder / made_name(1))  # whole, but of other scans
     (folder / "scans.json").write_bytes(b"")
     prepare("simulated:6", CONFIG, folder)
     assert all(np.array_equal(one[0], other[0]) for one, other in zip(pixels_of(folder), good, strict=True))
 
 
+def test_a_pixel_that_changed_within_its_checksum_is_found_by_its_fingerprint(folder):
+    spec = PreparedImages(str(folder)).spec
+    steps = np.full((1, 64, 512), 7, np.uint16)
+    ImageArrays(str(folder), spec).write(0, {"range": steps})
+    images = PreparedImages(str(folder))
+    assert np.all(images.read(0).range_m == np.float32(7 * spec.range_step_m))
+    with pytest.raises(DataError, match="pixels of scan 0 that differ from their fingerprint"):
+        images.read(0, verify=True)
+
+
+@pytest.mark.parametrize("plane", ["range", "reflectance", "label"])
+def test_what_is_not_there_is_never_taken_for_zeros(folder, plane):
+    (folder / pixels_name(plane, 0)).unlink()
+    with pytest.raises(DataError, match="differ from their fingerprint"):
+        PreparedImages(str(folder)).read(0)
+
+
+def test_a_scan_without_a_return_is_none_that_is_lost(tmp_path):
+    spec = prepare("simulated:1", CONFIG, tmp_path / "out")
+    writer = ShardWriter(tmp_path / "other", PreparedImages(str(spec)).spec, 0)
+    shape = 64, 512
+    writer.add(
+        0, RangeImage.masked(torch.ones(shape), torch.zeros(shape, dtype=torch.bool), CONFIG.load_sensor().fine())
+    )
+    writer.keep()
+    for name in ("plan.json", "scans.json"):
+        shutil.copy(tmp_path / "out" / name, tmp_path / "other" / name)
+    assert not PreparedImages(str(tmp_path / "other")).read(0, verify=True).range_m.any()
+    assert (tmp_path / "other" / RANGES).is_file()
+
+
 @pytest.mark.parametrize(
     "change",
     [
-        {"offset": -1},
-        {"offset": 10**9},
-        {"range_bytes": 10**12},
-        {"range_bytes": "many"},
         {"scan": 77},
         {"scan": None},
         {"scan": False},
-        {"offset": 8.0},
+        {"full_scale": 8.0},
+        {"full_scale": -1},
         {"fingerprint": [1]},
-        {"reflectance_bytes": 3},
+        {"range_fingerprint": None},
+        {"offset": 3},
     ],
 )
-def test_an_index_that_lies_is_refused(folder, change):
-    path = folder / "000000.shard"
-    content = path.read_bytes()
-    length = int.from_bytes(content[-16:-8], "little")
-    index = json.loads(content[-16 - length : -16])
-    index["entries"][0] |= change
-    changed = json.dumps(index).encode()
+def test_facts_that_lie_are_refused(folder, change):
+    facts = json.loads((folder / MADE).read_text())
+    facts["images"][0] |= change
+    changed = json.dumps(facts).encode()
     for lie in (changed, b"[" * 100_000, b"null", changed[:-1] + b', "x": 1e400}'):
-        path.write_bytes(content[: -16 - length] + lie + len(lie).to_bytes(8, "little") + content[-8:])
-        with pytest.raises(DataError, match="shard"):
+        (folder / MADE).write_bytes(lie)
+        with pytest.raises(DataError, match=r"made/000000\.json"):
+            PreparedImages(str(folder))
+
+
+def test_an_array_of_another_shape_is_refused_before_it_is_read(folder):
+    path = folder / "images.zarr" / "range" / "zarr.json"
+    about = json.loads(path.read_text())
+    for change in ({"shape": [1, 64, 10**9]}, {"data_type": "float64"}, {"codecs": about["codecs"] * 2}):
+        path.write_text(json.dumps(about | change))
+        with pytest.raises(DataError, match=r"images\.zarr, damaged"):
             PreparedImages(str(folder)).read(0)
 
 
 def test_a_blob_that_claims_to_be_gigabytes_is_refused_before_they_are_allocated(folder):
-    path = folder / "000000.shard"
+    path = folder / RANGES
     content = bytearray(path.read_bytes())
-    content[8 + 4 : 8 + 8] = (1 << 31).to_bytes(4, "little")  # the size in the header of the first blob
+    index = content[-(128 * 16 + 4) : -4]
+    start, length = (int.from_bytes(index[at : at + 8], "little") for at in (0, 8))
+    blob = content[start : start + length - 4]
+    blob[4:8] = (2**31 - 256).to_bytes(4, "little")  # the size of the pixels
+    content[start : start + length] = blob + crc32c(bytes(blob)).to_bytes(4, "little")
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"2147483648 bytes of pixels for an image of 65536"):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(DataError, match=r"images\.zarr, damaged"):
         PreparedImages(str(folder)).read(0)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2**20, "in KiB"
 
 
 @pytest.mark.parametrize("name", ["plan.json", "scans.json"])
@@ -128,7 +175,7 @@ def test_another_step_of_range_than_the_sensors_is_refused(folder, step_m):
         PreparedImages(str(folder))
 
 
-@pytest.mark.parametrize("name", ["plan.json", "scans.json", "000000.shard"])
+@pytest.mark.parametrize("name", ["plan.json", "scans.json", MADE])
 def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
     (folder / name).unlink()
     os.mkfifo(folder / name)
@@ -143,7 +190,7 @@ def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
     config = DataConfig(workers=1)
     with pytest.raises(ScanError, match=r"--bad-scans skip"):
         prepare(str(tree), config, tmp_path / "out")
-    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.shard")}
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("images.zarr/*/c.*")}
     assert made
     assert len(PreparedImages(str(prepare(str(tree), replace(config, bad_scans="skip"), tmp_path / "out")))) == 4
     assert {path: path.stat().st_mtime_ns for path in made} == made
@@ -161,7 +208,7 @@ def test_a_preparation_that_made_nothing_leaves_its_folder_free(tmp_path, monkey
     assert not list(out.iterdir())
     with claim_folder(out, shared=True), pytest.raises(ScanError):  # as another machine does that works by the plan
         prepare(str(tree), CONFIG, out)
-    assert {path.name for path in out.iterdir()} == {"plan.json", "scans.json"}
+    assert {path.name for path in out.iterdir()} == {"plan.json", "scans.json", "made"}
 
     failed = []
 
@@ -208,20 +255,9 @@ def test_a_link_to_nothing_is_left_out_where_bad_scans_are(tmp_path):
 def test_a_machine_verifies_its_own_shards_alone(tmp_path, small_shards):
     """Another one may be making a damaged shard again, which must not be taken for damaged and removed."""
     folder = prepare("simulated:6", CONFIG, tmp_path / "out")
-    second = folder / "000001.shard"
+    second = folder / pixels_name("range", 1)
     content = bytearray(second.read_bytes())
     content[5000] ^= 255
     second.write_bytes(content)
     assert damaged_shards(folder, rank=0, world_size=2) == []
     assert damaged_shards(folder, rank=1, world_size=2) == [1]
-
-
-def test_more_shards_than_a_process_may_open_are_opened_all_the_same(tmp_path):
-    (tmp_path / "shard").write_bytes(b"bytes")
-    allowed, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(128, allowed), most))
-        kept = [LocalBytes(tmp_path / "shard") for _ in range(150)]
-        assert bytes(kept[-1].read(1, 3)) == b"yt"
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, most))

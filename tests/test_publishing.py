@@ -5,10 +5,8 @@ import json
 import os
 import re
 import shutil
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from PIL import Image
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core import configuration
-from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.files import write_json
 from lidargrit.data.datasets import data_set_and_split, load, open_dataset
 from lidargrit.data.datasets import folder as folder_of_scans
@@ -31,7 +28,6 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.presets import load_preset
 from lidargrit.publishing import publish
 from lidargrit.publishing.card import model_card
-from lidargrit.systems.lidargrit.system import LidarGrit
 from lidargrit.systems.marginal.system import Marginal
 from lidargrit.training.taken_stages import taken_facts
 from tiny_runs import MODEL, SHORT, contents, the_one_line
@@ -360,40 +356,3 @@ def test_prepared_scans_are_named_by_what_they_were_prepared_from(tmp_path):
     prepared = ["-o", str(tmp_path / "prepared"), "--set", "data.columns=64", "--workers", "1"]
     assert main(["prepare", "simulated:2:train", *prepared]) == 0
     assert data_set_of(str(tmp_path / "prepared")) == ("simulated", "train")
-
-
-def test_saved_and_read_in_the_hubs_way(tmp_path):
-    model = marginal()
-    model.save_pretrained(str(tmp_path / "model"), card="# A model\n")
-    assert set(contents(tmp_path / "model")) == {"README.md", "config.json", "model.safetensors"}
-    again = Marginal.from_pretrained(str(tmp_path / "model"))
-    assert all(torch.equal(of, again.state_dict()[name]) for name, of in model.state_dict().items())
-    assert isinstance(Generator.from_pretrained(tmp_path / "model"), Marginal)
-    with pytest.raises(CheckpointError, match="holds a generator 'marginal'; wanted one of 'lidargrit'"):
-        LidarGrit.from_pretrained(tmp_path / "model")
-    model.save_pretrained(tmp_path / "bare")
-    assert set(contents(tmp_path / "bare")) == {"config.json", "model.safetensors"}
-
-
-def test_a_name_that_is_no_folder_is_asked_of_the_hub(tmp_path, monkeypatch):
-    marginal().save_pretrained(tmp_path / "fetched")
-    asked = []
-
-    def snapshot_download(name, revision, allow_patterns):
-        asked.append((name, revision, tuple(allow_patterns)))
-        if name == "nobody/nothing":
-            raise RuntimeError("404\nlong story")
-        return str(tmp_path / "fetched")
-
-    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=snapshot_download))
-    assert isinstance(Generator.from_pretrained("some-one/model.1", revision="v1"), Marginal)
-    assert asked == [("some-one/model.1", "v1", ("*.json", "model.safetensors"))]
-    with pytest.raises(ConfigError, match=r"^got revision='v1' of .*fetched, which is a folder here; wanted "):
-        Generator.from_pretrained(tmp_path / "fetched", revision="v1")
-    with pytest.raises(CheckpointError, match=r"which cannot be fetched \(RuntimeError: 404\);"):
-        Generator.from_pretrained("nobody/nothing")
-    with pytest.raises(CheckpointError, match="runs/mine/gone, which is no folder"):
-        Generator.from_pretrained("runs/mine/gone")
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)  # as if it were not installed
-    with pytest.raises(CheckpointError, match=r"pip install 'lidargrit\[hub\]'"):
-        Generator.from_pretrained("some-one/model")

@@ -16,7 +16,7 @@ from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm, R2dmConfig, load_published
+from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm, R2dmConfig
 from lidargrit.systems.r2dm.unet import EfficientUnet, UnetConfig
 from reference_unet import SlowUnet
 
@@ -141,7 +141,7 @@ def test_the_published_size_has_the_published_parameters_and_operations():
 def test_published_weights_give_what_a_slow_network_gives(tmp_path):
     checkpoint = seeded_checkpoint()
     torch.save(checkpoint, tmp_path / "weights.pth")
-    generator = load_published(tmp_path / "weights.pth")
+    generator = R2dm.from_published([tmp_path / "weights.pth"], R2dmConfig(), load_sensor("hdl64e_kitti_360"))
     rng = torch.Generator().manual_seed(1)
     noisy = torch.randn(2, 2, 64, 1024, generator=rng)
     log_snr = torch.tensor([-7.5, 2.25])
@@ -173,7 +173,9 @@ def test_both_layouts_that_the_program_has_written_are_read(tmp_path):
     generators = []
     for layout_of_2024 in (False, True):
         torch.save(seeded_checkpoint(layout_of_2024), tmp_path / "weights.pth")
-        generators.append(load_published(tmp_path / "weights.pth"))
+        generators.append(
+            R2dm.from_published([tmp_path / "weights.pth"], R2dmConfig(), load_sensor("hdl64e_kitti_360"))
+        )
     first, second = (generator.state_dict() for generator in generators)
     assert generators[0].config == generators[1].config
     assert all(torch.equal(first[name], second[name]) for name in first if name.startswith("network."))
@@ -198,7 +200,7 @@ def test_settings_of_the_later_layout_are_checked_under_their_names(tmp_path, pa
     checkpoint["cfg"][part][name] = value
     torch.save(checkpoint, tmp_path / "weights.pth")
     with pytest.raises(CheckpointError, match=rf"with {part}\.{name}={value!r}; wanted {part}\.{name}="):
-        load_published(tmp_path / "weights.pth")
+        R2dm.from_published([tmp_path / "weights.pth"], R2dmConfig(), load_sensor("hdl64e_kitti_360"))
 
 
 def test_sizes_that_the_weights_do_not_have_are_refused_before_a_network_is_built(tmp_path):
@@ -207,7 +209,7 @@ def test_sizes_that_the_weights_do_not_have_are_refused_before_a_network_is_buil
         checkpoint["cfg"]["model"][name] = value
         torch.save(checkpoint, tmp_path / "weights.pth")
         with pytest.raises(CheckpointError, match=r"whose level 1 is not of |wanted 1000 at most"):
-            load_published(tmp_path / "weights.pth")
+            R2dm.from_published([tmp_path / "weights.pth"], R2dmConfig(), load_sensor("hdl64e_kitti_360"))
 
 
 @pytest.mark.parametrize("name", discovery.names("sensors"))
@@ -234,8 +236,8 @@ def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return(name):
         (lambda c: c["cfg"].update(model_coords_embedding=None), "model_coords_embedding=None"),
         (lambda c: c["cfg"].update(model_channel_multiplier=(1, 2)), "channel_multipliers"),
         (lambda c: c["cfg"].update(model_gn_eps=1e-5), "model_gn_eps=1e-05; wanted model_gn_eps=1e-06"),
-        (lambda c: c["ema_weights"].pop("denoiser.in_conv.bias"), "lacks 'network.in_conv.bias'"),
-        (lambda c: c["ema_weights"].update({"denoiser.new": torch.ones(1)}), "has besides 'network.new'"),
+        (lambda c: c["ema_weights"].pop("denoiser.in_conv.bias"), "lacks 'in_conv.bias'"),
+        (lambda c: c["ema_weights"].update({"denoiser.new": torch.ones(1)}), "has besides 'new'"),
         (lambda c: c.pop("ema_weights"), r"cannot be read \(KeyError: 'ema_weights'\)"),
     ],
 )
@@ -244,7 +246,7 @@ def test_weights_of_another_form_are_refused(tmp_path, change, text):
     change(checkpoint)
     torch.save(checkpoint, tmp_path / "weights.pth")
     with pytest.raises((CheckpointError, ConfigError), match=text):
-        load_published(tmp_path / "weights.pth")
+        R2dm.from_published([tmp_path / "weights.pth"], R2dmConfig(), load_sensor("hdl64e_kitti_360"))
 
 
 @pytest.mark.parametrize(
@@ -253,7 +255,7 @@ def test_weights_of_another_form_are_refused(tmp_path, change, text):
 def test_a_file_that_is_no_checkpoint_is_refused_and_never_run(tmp_path, content):
     (tmp_path / "weights.pth").write_bytes(content)
     with pytest.raises(CheckpointError, match=r"weights\.pth, which (is no|does not hold)"):
-        load_published(tmp_path / "weights.pth")
+        R2dm.from_published([tmp_path / "weights.pth"], R2dmConfig(), load_sensor("hdl64e_kitti_360"))
 
 
 def test_ranges_are_encoded_as_published_and_come_back():

@@ -24,15 +24,6 @@ class OfClass(Condition):
 
     number: Tensor
 
-    def __len__(self) -> int:
-        return len(self.number)
-
-    def __getitem__(self, index: slice | list[int]):
-        return type(self)(self.number[index])
-
-    def to(self, device: torch.device | str):
-        return type(self)(self.number.to(device))
-
 
 class MoreRoad(ToldOfScans):
     """Whether a fifth of the returns are of the road."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         project,
         raydrop,
         simulate,
+        torch_dataset,
         unproject,
         upsample,
     )
@@ -36,6 +37,7 @@ __all__ = [
     "project",
     "raydrop",
     "simulate",
+    "torch_dataset",
     "unproject",
     "upsample",
 ]

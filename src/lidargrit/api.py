@@ -14,6 +14,7 @@ from lidargrit.data.formats import BadPoints
 from lidargrit.data.run_folder import PACKAGED
 from lidargrit.data.sources import Source, open_source
 from lidargrit.data.sources.memory import MemorySource
+from lidargrit.data.torch_dataset import TorchDataset
 from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import load
@@ -41,6 +42,7 @@ __all__ = [
     "project",
     "raydrop",
     "simulate",
+    "torch_dataset",
     "unproject",
     "upsample",
 ]
@@ -192,3 +194,18 @@ def _opened(model: str | Model, kind: ConditionKind, sensor: SensorModel | None 
 @lru_cache
 def _packaged(name: str, kind: ConditionKind) -> Model:
     return open_model(name, kind)
+
+
+def torch_dataset(source: str, sensor: SensorModel | str | None = None) -> TorchDataset:
+    """Return the range images of a source as a data set for torch's loaders.
+
+    Args:
+        source: samples, prepared scans, a data set, a folder, or "simulated:COUNT".
+        sensor: sensor that scans are projected with; the source's own if not given.
+
+    Example:
+        >>> dataset = torch_dataset("simulated:2", load_sensor("hdl64e_kitti_odometry").with_columns(64))
+        >>> dataset[1]["range_m"].shape
+        torch.Size([64, 64])
+    """
+    return TorchDataset(source, load_sensor(sensor) if isinstance(sensor, str) else sensor)

@@ -218,7 +218,7 @@ def test_a_damaged_cache_is_made_anew(tmp_path, monkeypatch, damage):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path))
     config = DataConfig(train=("simulated:2",), val=(), columns=512, column_stride=8)
     before = load_range_images(config.train, config).batch([0, 1]).range_m
-    (path,) = tmp_path.glob("*/*.shard")
+    (path,) = tmp_path.glob("*/images.zarr/range/c.*")
     content = path.read_bytes()
     path.unlink()
     if damage != "gone":

@@ -34,8 +34,9 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-@pytest.mark.parametrize("verb", ["train", "view", "evaluate", "demo"])
+@pytest.mark.parametrize(
+    ("verb", "damage"), [*(("view", each) for each in DAMAGE), ("train", "NaN"), ("evaluate", "empty"), ("demo", "NaN")]
+)
 def test_a_damaged_scan(refused, rows, tmp_path, verb, damage):
     folder = tmp_path / "scans"
     folder.mkdir()
@@ -51,7 +52,7 @@ def test_a_damaged_scan(refused, rows, tmp_path, verb, damage):
     assert re.search(DAMAGE[damage].replace("BAD", re.escape("scans/000001.bin")), refused(*words))
 
 
-@pytest.mark.parametrize("damage", ["NaN", "infinite", "origin"])
+@pytest.mark.parametrize("damage", ["infinite", "origin"])
 def test_bad_points_are_dropped_by_the_setting_that_the_message_names(refused, rows, tmp_path, damage):
     (tmp_path / "scans").mkdir()
     (tmp_path / "scans" / "000001.bin").write_bytes(changed(rows, damage))
@@ -62,7 +63,7 @@ def test_bad_points_are_dropped_by_the_setting_that_the_message_names(refused, r
     assert (tmp_path / "run" / "model.safetensors").exists()
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("damage", ["cut short", "NaN", "reflectance"])
 def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, rows, tmp_path, capsys, damage):
     (tmp_path / "scans").mkdir()
     for index, name in enumerate(("not at all", damage, "not at all")):

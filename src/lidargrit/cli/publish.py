@@ -6,7 +6,7 @@ from pathlib import Path
 EXAMPLES = """\
   lidargrit publish runs/mine to_share
   lidargrit publish runs/mine to_share --scores scores.json        scores written by: lidargrit evaluate --json
-  lidargrit publish runs/mine to_share --notes failures.md --bits 8    a quarter of the size
+  lidargrit publish runs/mine to_share --notes failures.md --bits 32    four times the size, and nothing rounded
 """
 
 
@@ -18,8 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scores = "scores of the run's samples for the card, written by: lidargrit evaluate --json"
     add("--scores", type=Path, metavar="JSON", help=scores)
     add("--notes", type=Path, metavar="MD", help="Markdown file for the end of the card, such as known failures")
-    bits = "bits of a stored weight; networks compute in 32 bits whatever it is (default: %(default)s)"
-    add("--bits", type=int, choices=(8, 16, 32), default=32, help=bits)
+    bits = "bits of a stored weight; networks compute in 32 bits whatever it is (default: 8; 32 beside --scores)"
+    add("--bits", type=int, choices=(8, 16, 32), help=bits)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -39,10 +39,7 @@ class _Place(NamedTuple):
     """Where a name is defined.
 
     Args:
-        path: file that defines it.
-        module: name of the file's module.
         table: table of the file that holds it; "" where the file holds nothing else.
-        title: description of it in the table.
     """
 
     path: Path

@@ -69,6 +69,10 @@ class OutputError(LidarGritError):
     """A file or folder to write is taken, or could not be written."""
 
 
+class HeldError(OutputError):
+    """Another process writes into the folder."""
+
+
 class TrainingError(LidarGritError):
     """Training cannot go on."""
 

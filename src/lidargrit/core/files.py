@@ -15,7 +15,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidargrit.core.errors import CheckpointError, ConfigError, LidarGritError, OutputError, one_of
+from lidargrit.core.errors import CheckpointError, ConfigError, HeldError, LidarGritError, OutputError, one_of
 from lidargrit.core.untrusted import JSON_BYTES_AT_MOST, TEXT_BYTES_AT_MOST, parse_json
 
 if TYPE_CHECKING:  # quick start of commands that only read and write JSON
@@ -60,8 +60,8 @@ def claim_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         shared: allow others that claim it as shared too, such as several processes that sample into one folder.
 
     Raises:
-        OutputError: another process holds the folder, it cannot be written to, or at the end it turns out to have been
-            removed meanwhile.
+        HeldError: another process holds the folder.
+        OutputError: it cannot be written to, or at the end it turns out to have been removed meanwhile.
     """
     is_new = not folder.exists()
     try:
@@ -145,7 +145,7 @@ def _lock(folder: Path, kind: int) -> int:
             except BlockingIOError:
                 holder = os.pread(lock, 200, 0).decode(errors="replace") or "another command"
                 os.close(lock)
-                raise OutputError(
+                raise HeldError(
                     f"{folder}, which {holder} is writing",
                     "a folder that no other process writes",
                     "wait for its end, or choose another folder",

@@ -22,8 +22,6 @@ class Bounds:
     """Bounds of a number, or of how many values a tuple has, beside a type: ``Annotated[int, Bounds(1, 16)]``.
 
     Args:
-        least: smallest value that fits.
-        most: largest value that fits.
         above: largest value that is too small.
         below: smallest value that is too large.
         multiple_of: divisor of whole numbers that fit.

@@ -28,7 +28,6 @@ class Batches:
         any_columns: whether an image may begin at any fine column; see :class:`TrainingConfig`.
         rank: number of this process, from 0; it takes its share of every batch.
         world_size: number of processes that train together.
-        workers: number of threads that read ahead.
         condition_of: function from a batch of images to what a generator is told of each; nothing if not given.
     """
 

@@ -37,7 +37,6 @@ class DriveConfig:
     Args:
         seed: seed of the first street; each further street has the next seed.
         frames: scans of each street, 0.1 s apart; with 1, every scan shows another street. A street ends after 100 m.
-        theme: kind of street.
         motion: whether scans keep the distortion by the car's own motion; KITTI odometry has it removed.
         wet: wetness of the ground, from 0 (dry) to 1 (soaked).
         clean: whether ``observation/NNNNNN.npz`` is written, too, from which raydrop models are trained and judged: the

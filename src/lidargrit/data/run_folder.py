@@ -78,11 +78,7 @@ def is_unfinished(folder: Path) -> bool:
 
 
 class SavedConfig(NamedTuple):
-    """What the configuration of a finished run says.
-
-    Args:
-        config: configuration of the generator, as plain values.
-    """
+    """What the configuration of a finished run says."""
 
     generator: str
     config: Any

@@ -43,9 +43,7 @@ class ScanFolder:
         out: an empty folder, or one that the same command began; more scans can be added to it.
         manifest: name of the file that says how the scans were made, and which file holds which.
         facts: entries of the manifest, among them the ``source``; a folder with other entries is refused.
-        files: file of each scan, below the folder.
         identities: identity of the scan in each file, such as its name in the source.
-        bad_scans: treatment of a scan that cannot be used.
 
     Attributes:
         missing: indices of the files that are still to be written.
@@ -183,11 +181,7 @@ def write_array(path: Path, pixels: Float[Tensor, "H W"]) -> None:
 
 
 class KittiTree:
-    """The tree of KITTI odometry, with labels as SemanticKITTI has them.
-
-    Args:
-        out: folder of the tree.
-    """
+    """The tree of KITTI odometry, with labels as SemanticKITTI has them."""
 
     keeps_labels = True
 

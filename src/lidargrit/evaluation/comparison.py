@@ -29,7 +29,6 @@ class EvalConfig:
     """How two sets are compared.
 
     Args:
-        protocol: name of the protocol.
         metrics: names of metrics, in place of the protocol's; metrics of the protocol keep its definitions.
         variant: one definition for all metrics, in place of the protocol's.
         sensor: name or ``.json`` file of the sensor that scans are imaged with, in place of the protocol's.
@@ -41,7 +40,6 @@ class EvalConfig:
         pixel_statistics: whether every score gets that of pixel statistics of the reference beside it.
         samples_format: name of the program that wrote a folder of tensors; recognised from the first file if empty.
         device: name of the device that networks compute on.
-        data: settings of reading scans.
     """
 
     protocol: str = DEFAULT

@@ -23,10 +23,8 @@ class EvalSet:
     """One set of range images that goes into the metrics.
 
     Args:
-        indices: indices of the images that are compared.
         range_m: nearest and farthest range of a return, in metres, both excluded; None for no limits.
         data_set: name of the data set; "samples" for generated images, "" where it is not known.
-        split: part of the data set.
         projection_variant: variant by which scans became images; "" where it is not known.
         weights_sha256: hash of the weights that generated the images; "" where there are none, or it is not known.
         full_rows: rows in which every ray returns, with none in the others; None where rays may drop.

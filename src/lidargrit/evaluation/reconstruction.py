@@ -69,7 +69,6 @@ class ReconstructionErrors:
         scan_rmse_m: root of the mean squared range error of a scan in metres; lower is better.
         rmse_log: root of the mean squared error of ln(range); lower is better.
         accuracy_1_25: share of returns with max(decoded / real, real / decoded) < 1.25; higher is better.
-        num_scans: number of pairs.
     """
 
     range_mae_m: float

@@ -45,7 +45,6 @@ class _FedMetric:
     """One metric, fed group by group.
 
     Args:
-        factory: function that makes the metric.
         generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.
         real_as_generated: metrics that were fed the same real scans as generated ones, for real against real.

@@ -14,12 +14,7 @@ from lidargrit.scans.types import RangeImage
 
 
 class BatchSeeds(Sequence[int]):
-    """Seeds of one batch: those asked for, then copies of the last one that fill the batch up.
-
-    Args:
-        asked_for: seeds whose scans are wanted.
-        size: number of scans of a batch.
-    """
+    """Seeds of one batch: those asked for, then copies of the last one that fill the batch up."""
 
     def __init__(self, asked_for: Sequence[int], size: int) -> None:
         self._seeds = (*asked_for, *[asked_for[-1]] * (size - len(asked_for)))

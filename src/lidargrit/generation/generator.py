@@ -8,16 +8,18 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
+from torch import Tensor
 
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import WEIGHTS_FILE, Job, is_bundle, locate, named_folder
+from lidargrit.data.run_folder import Job, is_bundle, locate, named_folder
 from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
 from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
+from lidargrit.generation.hub import located
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, download, read_saved
+from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.bits import ScanBits
@@ -54,7 +56,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     """Precision in which stages are trained where no preset names one."""
 
     trains: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    """Stages of training in order, each with the names of the networks, here and in its objective, that it trains."""
+    """Stages of training in order, each with the names of the networks, here and in its objective, that it trains.
+
+    A stage takes place if its networks are there. The objective may be the network itself.
+    """
 
     published_files: ClassVar[tuple[str, ...]] = ()
     """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
@@ -100,7 +105,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages of training, in their order; they may depend on ``config``."""
-        return tuple(stage for stage, *_ in self.trains)
+        there = dict(self.named_children())
+        return tuple(stage for stage, *names in self.trains if all(name in there for name in names))
 
     @property
     def full_rows(self) -> range | None:
@@ -130,7 +136,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Load the weights of a stage's trained objective."""
         for name in next(names for one, *names in self.trains if one == stage):
-            self.get_submodule(name).load_state_dict(objective.get_submodule(name).state_dict())
+            network = self.get_submodule(name)
+            trained = objective if type(objective) is type(network) else objective.get_submodule(name)
+            network.load_state_dict(trained.state_dict())
 
     def after_training(self) -> None:
         """Fit what depends on all trained stages."""
@@ -332,17 +340,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return cls.facts.lines(cls.capabilities, configuration.own_first(cls.Sampling()), cls.not_of_sampling)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> "Generator[Any, Any]":
-        """Make a generator with the weights that the system's authors published, or that their program saved.
-
-        Args:
-            files: one file for each of ``published_files``, in that order; code in them is not run.
-            config: sizes of the networks, used where the files do not tell them.
-            sensor: sensor whose rays are the pixels of the authors' images.
-
-        Raises:
-            CheckpointError: other files, or weights of other sizes.
-        """
+    def read_published(
+        cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel
+    ) -> tuple[ConfigT, dict[str, dict[str, Tensor]]]:
+        """Read the configuration and the weights in published files; see :meth:`from_published`."""
         able = [name for name in discovery.names("generators") if load_class(name).published_files]
         raise ConfigError(
             f"a generator {cls.public_name()!r}, of which nobody published weights",
@@ -351,30 +352,28 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         )
 
     @classmethod
-    def from_pretrained(cls, name: str | Path, revision: str | None = None) -> "Generator[Any, Any]":
+    def from_pretrained(
+        cls,
+        pretrained_model_name_or_path: str | Path,
+        *,
+        revision: str | None = None,
+        force_download: bool = False,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+    ) -> "Generator[Any, Any]":
         """Read a generator from a folder, or from a repository of the Hugging Face hub.
 
-        Args:
-            name: folder of a run or of a published generator, or else "USER/REPOSITORY" on the hub.
-            revision: branch, tag or commit of the repository; its main branch if not given.
+        Its arguments are those of :func:`lidargrit.generation.hub.located`.
 
         Raises:
             CheckpointError: no such folder or repository, a damaged one, or another kind of generator in it.
-            ConfigError: a revision of a folder, which has none.
         """
-        here = named_folder(name)
-        if here.is_dir() and revision is not None:
-            got = f"revision={revision!r} of {name}, which is a folder here"
-            raise ConfigError(
-                got, "a repository on the hub, or no revision", "leave it out, or start in another folder"
-            )
-        generator = load(here if here.is_dir() else download(str(name), revision, ["*.json", WEIGHTS_FILE]))
+        name = pretrained_model_name_or_path
+        generator = load(located(name, revision, force_download, token, cache_dir, local_files_only))
         if not isinstance(generator, cls):
-            raise CheckpointError(
-                f"{name}, which holds a generator {generator.public_name()!r}",
-                f"one of {cls.public_name()!r}",
-                "read it with Generator.from_pretrained",
-            )
+            got, wanted = (f"a generator {each.public_name()!r}" for each in (generator, cls))
+            raise CheckpointError(f"{name}, which holds {got}", wanted, "read it with Generator.from_pretrained")
         return generator
 
 

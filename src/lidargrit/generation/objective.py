@@ -12,11 +12,7 @@ from lidargrit.scans.types import RangeImage
 
 
 class Objective(nn.Module, ABC):
-    """A loss over batches of examples; its parameters are what the stage trains.
-
-    Args:
-        sensor: sensor whose range images the objective takes.
-    """
+    """A loss over batches of examples; its parameters are what the stage trains."""
 
     sensor: SensorModel
     players: tuple[str, ...] = ()

@@ -1,22 +1,24 @@
 """A network with its configuration and sensor ⇄ the two files in which it is saved, here or on the Hugging Face hub."""
 
-import importlib
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar, Generic, Self, TypeVar, final
 
 from torch import Tensor, nn
 
 from lidargrit.core import configuration
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors, write_json, write_tensors, write_text
 from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE, Job, read_config, told_of
+from lidargrit.generation.hub import upload
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.quantization import WeightBits, with_quantized, without_quantized
-from lidargrit.nn.size import numbers_at_most
+from lidargrit.nn.size import numbers_at_most, numbers_of_files
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
+
+_NEVER_PUBLISHED = ("usage", "code_sums", "num_batches_tracked", "scale_m")  # buffers that no program's file holds
 
 RunT = TypeVar("RunT")
 
@@ -107,38 +109,108 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         load_exactly(generator, weights, source)
         return generator.eval()
 
-    def save_pretrained(self, folder: str | Path, card: str = "", bits: WeightBits = 32) -> None:
+    @classmethod
+    @final
+    def from_published(cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel) -> Self:
+        """Make a generator with the weights that the system's authors published, or that their program saved.
+
+        Args:
+            files: one file for each of ``published_files``, in that order; code in them is not run.
+            config: sizes of the networks, used where the files do not tell them.
+            sensor: sensor whose rays are the pixels of the authors' images. Networks that know the rays keep those of
+                their training.
+
+        Raises:
+            CheckpointError: other files, or weights of other sizes.
+        """
+        config, networks = cls.read_published(files, config, sensor)
+        with numbers_of_files(files):
+            generator = cls(config, sensor)
+        for number, (name, weights) in enumerate(networks.items()):
+            network = generator.get_submodule(name)
+            own = network.state_dict()
+            kept = {each: own[each] for each in own if each.rpartition(".")[2] in _NEVER_PUBLISHED}
+            load_exactly(network, kept | weights, files[number % len(files)])
+        return generator.eval()
+
+    @classmethod
+    def read_published(
+        cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel
+    ) -> tuple[ConfigT, dict[str, dict[str, Tensor]]]:
+        """Read the configuration and the weights in published files; see :meth:`from_published`.
+
+        Returns:
+            the configuration, and the weights of each network by its name here, "" for the whole model; if there are
+            several files, one network of each.
+        """
+        raise NotImplementedError
+
+    def save_pretrained(
+        self,
+        save_directory: str | Path,
+        *,
+        card: str = "",
+        bits: WeightBits = 8,
+        repo_id: str | None = None,
+        push_to_hub: bool = False,
+        token: str | None = None,
+        private: bool | None = None,
+    ) -> str | None:
         """Write what a repository of the Hugging Face hub holds: weights, configuration, and a model card if given.
 
         These are the files of :meth:`save`. ``lidargrit publish`` writes the card from a run.
 
         Args:
-            folder: folder that gets the files.
+            save_directory: folder that gets the files.
             card: text of ``README.md``, in Markdown; no such file if empty.
             bits: bits of a parameter, 8, 16 or 32; see :meth:`weights`.
+            repo_id: repository that gets them, USER/NAME; named by the folder if not given.
+            push_to_hub: whether to upload the files, too.
+            token: the user's token; the one that the hub's client has saved if not given.
+            private: whether a new repository is private; the user's setting on the hub if not given.
+
+        Returns:
+            address of the commit if they were uploaded.
         """
-        self.save(Path(folder), bits)
+        folder = Path(save_directory)
+        self.save(folder, bits)
         if card:
-            write_text(Path(folder) / CARD_FILE, card)
+            write_text(folder / CARD_FILE, card)
+        if not push_to_hub:
+            return None
+        name, message = repo_id or folder.name, "Add a model"
+        return upload(folder, name, commit_message=message, private=private, token=token, branch=None, create_pr=None)
 
+    def push_to_hub(
+        self,
+        repo_id: str,
+        *,
+        card: str = "",
+        bits: WeightBits = 8,
+        commit_message: str = "Add a model",
+        private: bool | None = None,
+        token: str | None = None,
+        branch: str | None = None,
+        create_pr: bool | None = None,
+    ) -> str:
+        """Upload what :meth:`save_pretrained` writes, and return the address of the commit.
 
-def download(name: str, revision: str | None, patterns: list[str]) -> Path:
-    """Download files of a repository by the hub's own client, which keeps them in its cache.
-
-    Args:
-        patterns: names of the files wanted, of which ``*`` stands for any letters.
-    """
-    wanted, cure = "a run's folder, or USER/REPOSITORY on the Hugging Face hub", "check the name"
-    if not re.fullmatch(r"[\w.-]+/[\w.-]+", name):
-        raise CheckpointError(f"{name}, which is no folder", wanted, cure)
-    try:
-        hub = importlib.import_module("huggingface_hub")  # an extra: nothing else needs it
-        return Path(hub.snapshot_download(name, revision=revision, allow_patterns=patterns))
-    except ImportError:
-        got, cure = f"{name}, which is no folder here", "to fetch it from the hub: pip install 'lidargrit[hub]'"
-    except Exception as error:  # its client has a dozen kinds, from a wrong name to a broken line, and changes them
-        got = f"{name}, which cannot be fetched ({type(error).__name__}: {str(error).partition(chr(10))[0][:100]})"
-    raise CheckpointError(got, wanted, cure)
+        Args:
+            repo_id: repository, USER/NAME; made if it is missing.
+            branch: branch that gets the files; the main branch if not given.
+            create_pr: whether to open a pull request in place of a commit.
+        """
+        with TemporaryDirectory() as folder:
+            self.save_pretrained(folder, card=card, bits=bits)
+            return upload(
+                Path(folder),
+                repo_id,
+                commit_message=commit_message,
+                private=private,
+                token=token,
+                branch=branch,
+                create_pr=create_pr,
+            )
 
 
 def read_saved(folder: Path, class_of: Callable[[str], type[ModelT]]) -> ModelT:

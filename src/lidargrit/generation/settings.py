@@ -101,7 +101,6 @@ class Preset(Settings):
         title: description of the experiment in one line.
         generator: name of the generator, a folder of lidargrit.systems.
         model: configuration of the generator, of its own ``Config`` class.
-        data: settings of the data.
         training: settings of the training, by the name of the stage.
         seed: seed of everything random: weights, order, augmentation, dropout.
         published: scores that a paper reports for the experiment, for the reader; empty if no paper does.

@@ -101,6 +101,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     """
 
     Config = TokenGeneratorConfig
+    trains = (("tokenizer", "tokenizer"), ("transformer", "transformer"), ("pixels", "pixels"))
     capabilities = frozenset({"tokens", "encode", "likelihood"})
 
     def __init__(self, config: TokenConfigT, sensor: SensorModel) -> None:
@@ -132,19 +133,6 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         """Return a VQ-VAE of one block a level, and a transformer of one layer."""
         tokenizer = VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1, 1), code_dim=8, num_codes=32)
         return cls.Config(tokenizer, TransformerConfig(layers=1, heads=2, width=16))
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The tokenizer, then the transformer over its tokens, then the pixel decoder, if there is one."""
-        stages = ("tokenizer", "transformer")
-        return stages if self.config.pixels is None else (*stages, "pixels")
-
-    def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over a stage's trained weights."""
-        if stage == "tokenizer":
-            self.tokenizer.load_state_dict(objective.state_dict())
-        else:
-            self.get_submodule(stage).load_state_dict(objective.get_submodule(stage).state_dict())
 
     def get_tokenizer(self) -> Tokenizer:
         """Return the tokenizer."""

@@ -38,8 +38,6 @@ class VectorQuantiser(nn.Module):
     """A codebook, with counts of how its codes are used.
 
     Args:
-        num_codes: number of codes.
-        code_dim: length of a code.
         loss: name of the terms that move codes and latents towards each other; see ``_LOSS_WEIGHTS``.
         restart_dead: whether training replaces codes that are hardly ever chosen by latents of the batch, so that the
             codebook does not collapse. The reference has no such remedy.

@@ -1,7 +1,7 @@
 """A bound on the size of a network, checked while the network is built: settings → a network, or an error."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
@@ -18,9 +18,10 @@ NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network o
 _MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our presets have 2,000
 
 
-def numbers_of_file(path: Path) -> AbstractContextManager[None]:
-    """Refuse to build networks larger than the checkpoint of which their sizes were read; see numbers_at_most."""
-    return numbers_at_most(path.stat().st_size // 2 + 2**20, f"{path} with a network", "check which program saved it")
+def numbers_of_files(paths: Sequence[Path]) -> AbstractContextManager[None]:
+    """Refuse to build networks larger than the checkpoints of which their sizes were read; see numbers_at_most."""
+    size = sum(path.stat().st_size for path in paths)
+    return numbers_at_most(size // 2 + 2**20, f"{paths[0]} with a network", "check which program saved it")
 
 
 @contextmanager

@@ -62,7 +62,9 @@ def import_weights(preset: str, folder: Path, files: Sequence[Path], settings: S
     return generator
 
 
-def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = "", bits: WeightBits = 32) -> str:
+def publish(
+    run: Path, folder: Path, scores: Path | None = None, notes: str = "", bits: WeightBits | None = None
+) -> str:
     """Write the files of a run that others need into a folder, without the user's own paths; nothing is uploaded.
 
     A command that was killed, or that met a full disk, goes on where the same run is published again.
@@ -73,12 +75,12 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             without paths and file names, and last a model card (``README.md``). It can be used wherever a run can.
         scores: scores of the run's samples, as ``lidargrit evaluate --json`` wrote them.
         notes: Markdown for the end of the card: what the model is good for, and where it fails.
-        bits: bits of a stored parameter, 8, 16 or 32.
+        bits: bits of a stored parameter, 8, 16 or 32. If not given, 8; beside scores 32, as they are of whole weights.
 
     Returns:
         Text of the card.
     """
-    run = locate(run)
+    run, bits = locate(run), bits or (32 if scores else 8)
     generator = load(run)
     if (folder / CARD_FILE).exists() or not folder.is_dir():
         _refuse_taken(folder, None)  # soon, before much is read
@@ -110,7 +112,7 @@ def publish(run: Path, folder: Path, scores: Path | None = None, notes: str = ""
             named = (each for each in learned.recordings if not each.startswith("#"))
             drives = tuple(recording for recording in named if not Path(recording).is_absolute())
             write_trained_on(folder, replace(learned, recordings=drives))
-        generator.save_pretrained(folder, card, bits)  # the card last: it says that the folder is finished
+        generator.save_pretrained(folder, card=card, bits=bits)  # the card last: it says that the folder is finished
     return card
 
 

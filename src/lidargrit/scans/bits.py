@@ -16,7 +16,6 @@ class ScanBits:
 
     Args:
         step_mm: step in millimetres that ranges are rounded to.
-        return_mask: returns of the scans.
         tokens: bits of each token, given those before it.
         mask: bits of the return or ray drop of each pixel, given the tokens; None from a model that has no such
             probability.

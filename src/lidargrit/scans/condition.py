@@ -1,9 +1,8 @@
 """What is known of scans that are to be generated: nothing, or range images and masks → :class:`Observed`."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64, Shaped
@@ -14,9 +13,6 @@ from lidargrit.scans.planes import checked_planes, common_planes
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, sensor_of_all
 
-ConditionT = TypeVar("ConditionT", bound="Condition")
-NothingT = TypeVar("NothingT", bound="Nothing")
-ObservedT = TypeVar("ObservedT", bound="Observed")
 ConditionKind = Literal["pixels", "surfaces"]
 """What a condition knows of a pixel: whether the beam returned, and how far; or only how far the surface is."""
 
@@ -26,23 +22,60 @@ KINDS: dict[ConditionKind, str] = {
 }
 
 
-class Condition(ABC):
+@dataclass(frozen=True, eq=False)
+class Condition:
     """What is known of each scan of a batch; a generator generates scans of which it holds.
 
-    A subclass holds tensors of its own, the first axis of each for the scans.
+    A subclass is a frozen dataclass of tensors, or mappings of them, the first axis of each for the scans; it may have
+    a field ``sensor`` besides.
     """
 
-    @abstractmethod
     def __len__(self) -> int:
-        """Return the number of scans."""
+        """Return the number of scans; 0 for any."""
+        return max(map(len, self.tensors().values()), default=0)
 
-    @abstractmethod
-    def __getitem__(self: ConditionT, index: slice | list[int]) -> ConditionT:
+    def __getitem__(self, index: slice | list[int]) -> Self:
         """Return what is known of some of the scans."""
+        return self._mapped(lambda known: known[index])
 
-    @abstractmethod
-    def to(self: ConditionT, device: torch.device | str) -> ConditionT:
+    def to(self, device: torch.device | str) -> Self:
         """Return it with its tensors on another device."""
+        return self._mapped(lambda known: known.to(device))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return its tensors by the names of their fields; those of a mapping by both names with a dot between."""
+        found: dict[str, Tensor] = {}
+        for name, value in ((each.name, getattr(self, each.name)) for each in fields(self)):
+            if isinstance(value, Mapping):
+                found |= {f"{name}.{key}": known for key, known in value.items()}
+            elif isinstance(value, Tensor):
+                found[name] = value
+        return found
+
+    @classmethod
+    def of_tensors(cls, tensors: Mapping[str, Tensor], sensor: SensorModel) -> Self:
+        """Return the condition whose :meth:`tensors` these are, of scans of a sensor."""
+        given: dict[str, Any] = {}
+        for each in fields(cls):
+            below = {
+                name.removeprefix(f"{each.name}."): known
+                for name, known in tensors.items()
+                if name.startswith(f"{each.name}.")
+            }
+            if each.name == "sensor":
+                given["sensor"] = sensor
+            elif each.name in tensors or below:
+                given[each.name] = below or tensors[each.name]
+        return cls(**given)
+
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
+        changed: dict[str, Any] = {}
+        for name, value in ((each.name, getattr(self, each.name)) for each in fields(self)):
+            if isinstance(value, Mapping):
+                changed[name] = {key: change(known) for key, known in value.items()}
+            elif isinstance(value, Tensor):
+                changed[name] = change(value)
+        return replace(self, **changed)
 
     def put_into(self, generated: RangeImage) -> RangeImage:
         """Return generated scans in which all that is known pixel by pixel stands as it is known."""
@@ -52,16 +85,6 @@ class Condition(ABC):
 @dataclass(frozen=True)
 class Nothing(Condition):
     """Nothing is known, of as many scans as are asked for."""
-
-    def __len__(self) -> int:
-        return 0
-
-    def __getitem__(self: NothingT, index: slice | list[int]) -> NothingT:
-        return self
-
-    def to(self: NothingT, device: torch.device | str) -> NothingT:
-        """Return itself."""
-        return self
 
 
 NOTHING = Nothing()
@@ -151,7 +174,7 @@ class Observed(Condition):
         return cls(none.float(), none, none, none, sensor)
 
     @classmethod
-    def cat(cls: type[ObservedT], parts: Sequence[ObservedT]) -> ObservedT:
+    def cat(cls, parts: Sequence[Self]) -> Self:
         """Return the conditions of several batches as one; a plane is kept if every batch has it."""
         return cls(
             torch.cat([one.range_m for one in parts]),
@@ -161,28 +184,6 @@ class Observed(Condition):
             sensor_of_all([one.sensor for one in parts]),
             common_planes([one.planes for one in parts], torch.cat),
             _earlier_seeds(parts),
-        )
-
-    def __len__(self) -> int:
-        return len(self.range_m)
-
-    def __getitem__(self: ObservedT, index: slice | list[int]) -> ObservedT:
-        """Return the conditions of some of the scans."""
-        return self._mapped(lambda pixels: pixels[index])
-
-    def to(self: ObservedT, device: torch.device | str) -> ObservedT:
-        """Return the condition with its pixels on another device."""
-        return self._mapped(lambda pixels: pixels.to(device))
-
-    def _mapped(self: ObservedT, change: Callable[[Tensor], Tensor]) -> ObservedT:
-        return replace(
-            self,
-            range_m=change(self.range_m),
-            range_observed=change(self.range_observed),
-            return_mask=change(self.return_mask),
-            return_observed=change(self.return_observed),
-            planes={name: change(pixels) for name, pixels in self.planes.items()},
-            earlier_seeds=None if self.earlier_seeds is None else change(self.earlier_seeds),
         )
 
     @property

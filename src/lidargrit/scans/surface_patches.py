@@ -75,8 +75,8 @@ def _patches(pixels: Tensor) -> Tensor:
 def plane_residuals(image: RangeImage) -> Float64[np.ndarray, "H"]:
     """Return the median over planes of range minus the plane's range in each row, in metres; NaN where planes are few.
 
-    Planes that are struck at more than 81 degrees are left out. A constant offset of a laser is in the residuals of all its planes, but for the part that neighbouring rows share,
-    towards which the planes move.
+    Planes that are struck at more than 81 degrees are left out. A constant offset of a laser is in the residuals of
+    all its planes, but for the part that neighbouring rows share, towards which the planes move.
 
     Args:
         image: a single range image.

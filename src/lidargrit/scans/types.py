@@ -361,7 +361,6 @@ class MetricResult:
     """The value of a metric, with what is needed to read it.
 
     Args:
-        metric: name of the metric.
         value: value of the metric, in its unit.
         higher_is_better: whether a larger value is better.
         num_generated: number of generated scans.

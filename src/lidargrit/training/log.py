@@ -34,7 +34,6 @@ class Log:
     """The log of one stage. Entries later than the checkpoint from which the stage resumes are removed.
 
     Args:
-        folder: folder of the stage.
         scans_seen: number of scans seen at that checkpoint.
     """
 

@@ -20,11 +20,8 @@ class Measured:
     """What the training of one stage takes on this machine.
 
     Args:
-        stage: name of the stage.
         flops: floating-point operations of all steps.
-        scans_per_s: number of training scans per second.
         seconds: predicted time of all steps.
-        device: name of the device that computes.
         peak_gib: largest memory that this process has held so far, in GiB.
     """
 

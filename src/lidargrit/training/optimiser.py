@@ -124,7 +124,6 @@ class _Together(torch.optim.Optimizer):
     """Several optimisers that step as one; their parameter groups and their states are those of this one.
 
     Args:
-        parts: the optimisers.
         matrices: weights that take the shape of matrices while the optimisers step.
     """
 

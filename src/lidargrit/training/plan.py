@@ -30,8 +30,6 @@ class StagePlan:
         parameters: number of weights that the stage trains or uses.
         batch_size: number of scans in a step, over all processes.
         memory: size of weights, their average, gradients and the optimiser's moments, in bytes, without activations.
-        flops: number of floating-point operations of all steps.
-        precision: precision of the operations.
         taken_from: run whose trained stage is used as it is, so that nothing is computed; "" if the stage is trained.
     """
 
@@ -50,13 +48,9 @@ class TrainingPlan:
     """Settings, sizes and costs of the training of a preset.
 
     Args:
-        title: title of the preset.
         published: scores that a paper reports for the preset, or "".
         settings: value of every setting, by its dotted name.
-        rows: number of rows of an image.
-        columns: number of columns of an image.
         range_m: nearest and farthest range of a return, in metres.
-        stages: plans of the stages, in their order.
     """
 
     title: str
@@ -99,12 +93,7 @@ class TrainingPlan:
 
 @dataclass(frozen=True)
 class OpenedData:
-    """Sources of a preset's scans, of which none has been read.
-
-    Args:
-        train: sources of the training scans.
-        val: sources of the validation scans.
-    """
+    """Sources of a preset's scans, of which none has been read."""
 
     train: Sequence[DatasetSource | PreparedSource]
     val: Sequence[DatasetSource | PreparedSource]

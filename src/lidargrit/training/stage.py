@@ -78,7 +78,6 @@ class StageTraining:
         folder: folder of ``checkpoint.safetensors`` and ``log.jsonl``.
         seed: seed of order, augmentation, dropout and the objective's random numbers.
         built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
-        workers: number of threads that read ahead.
         condition: source of what the generator is told of each scan.
         plot: function that plots the averaged objective into a file; None for no pictures.
         deadline_s: value of ``time.monotonic()`` at which training stops as it does by SIGTERM.

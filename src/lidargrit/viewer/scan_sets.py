@@ -33,7 +33,6 @@ class ScanSet:
 
     Args:
         name: name of the scans' source, or of what a model made of it.
-        scan_names: name of each image.
         surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
             if no model was asked.
         filled: True for pixels whose point a model filled in; None where no scan says so.

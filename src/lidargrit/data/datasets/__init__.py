@@ -193,12 +193,7 @@ class ScanDataset(ABC):
 
 @dataclass(frozen=True)
 class Window:
-    """Scans of one recording in order of time.
-
-    Args:
-        dataset: data set that holds the scans.
-        indices: numbers of the scans there.
-    """
+    """Scans of one recording in order of time."""
 
     dataset: ScanDataset
     indices: tuple[int, ...]

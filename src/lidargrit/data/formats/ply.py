@@ -108,10 +108,7 @@ class _Header:
 
     Args:
         byte_order: numpy's sign for the byte order; empty for text.
-        before: elements before the vertices.
-        vertices: element of the vertices.
         end: position of the first element in the file, in bytes.
-        line_end: byte that ends a line.
     """
 
     byte_order: str

@@ -66,7 +66,6 @@ class ScanSettings:
     """Settings of reading scans from a command line, the same for all commands.
 
     Args:
-        data: settings of reading and projecting scans.
         sensor: name or ``.json`` file of the sensor; "" if none is named.
         projection_variant: variant of the projection; None if none is named.
     """

@@ -13,28 +13,20 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
 from lidargrit.core.errors import DataError, OutputError, counted_scans, no_usable_scan
-from lidargrit.core.files import claim_folder, is_taken, remove_partials, write_json, write_text
+from lidargrit.core.files import claim_folder, is_taken, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
+from lidargrit.data.prepared.arrays import range_step_m
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.imaging import choose_imaging
-from lidargrit.data.prepared.prepared import (
-    FORMAT,
-    PLAN_FILE,
-    SCANS_FILE,
-    PreparedFolder,
-    PreparedImages,
-    PreparedSpec,
-    shard_name,
-)
-from lidargrit.data.prepared.shards import LocalBytes, range_step_m, read_index
+from lidargrit.data.prepared.plan import ARRAYS, FORMAT, MADE_FOLDER, PLAN_FILE, SCANS_FILE, PreparedSpec, made_name
+from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages
 from lidargrit.data.prepared.workers import make_shards
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
 _SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 scans
 _BAD = ("bad_points", "bad_scans")  # the settings that refuse what cannot be used, or leave it out
-_WAIT_S, _PATIENCE_S = 0.5, 1800.0  # for shards that other machines make
 
 
 def prepare(
@@ -52,8 +44,8 @@ def prepare(
         config: settings by which scans become images, number of processes, and treatment of bad scans.
         folder: prepared folder; if not given, one in the cache, named by everything that the pixels depend on.
         sensor: sensor of the images, in place of the config's.
-        rank: number of this machine, from 0; it makes its part of the shards and waits for those of the others. If not
-            given, the environment's ``RANK``, else 0.
+        rank: number of this machine, from 0: machines begin at different shards, and each takes what is free until all
+            are there. If not given, the environment's ``RANK``, else 0.
         world_size: number of machines that share the work; if not given, the environment's ``WORLD_SIZE``, else 1.
         dataset: data set of the source, where it is open already.
 
@@ -68,21 +60,20 @@ def prepare(
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
     _claim(folder, spec, scans)
     missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, spec, shard)]
-    if missing:  # a complete folder may be one that this user can only read
-        try:
-            with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
-                if not (folder / PLAN_FILE).exists():  # another machine has failed meanwhile, and taken its plan back
-                    _claim(folder, spec, scans)
-                mine = [shard for shard in missing if shard % world_size == rank]
-                make_shards(folder, spec, mine, dataset, config.workers)
-                _wait_for(folder, spec, [shard for shard in missing if shard % world_size != rank])
-        except BaseException:
-            _take_back(folder)
-            raise
-    remove_partials(folder)
-    for left in folder.glob("*.unfinished"):  # by a process that was killed after it had written the shard
-        with suppress(OSError):  # of a folder that this user can only read
-            left.unlink()
+    if not missing:  # a complete folder may be one that this user can only read
+        return folder
+    try:
+        with claim_folder(folder, shared=True):  # with other machines, and with whoever needs the same cache
+            if not (folder / PLAN_FILE).exists():  # another machine has failed meanwhile, and taken its plan back
+                _claim(folder, spec, scans)
+            first = len(missing) * rank // world_size
+            make_shards(folder, spec, missing[first:] + missing[:first], dataset, config.workers)
+    except BaseException:
+        _take_back(folder)
+        raise
+    finally:
+        with suppress(OutputError, OSError), claim_folder(folder):  # nobody else writes
+            _sweep(folder)
     return folder
 
 
@@ -91,7 +82,6 @@ class Prepared:
     """Size and content of a prepared folder.
 
     Args:
-        rows: number of rows of an image.
         columns: number of fine columns of an image.
         size: size of all shards, in bytes.
         seconds: time that the preparation took, in seconds.
@@ -140,16 +130,16 @@ def prepare_and_describe(
     config, sensor = imaging.config, imaging.sensor
     folder = prepare(source, config, folder, sensor, rank, world_size, dataset)
     if verify and (damaged := damaged_shards(folder, rank, world_size)):
-        reporting.message(f"damaged and made again: {', '.join(map(shard_name, damaged))}")
+        reporting.message(f"damaged and made again: shards {', '.join(map(str, damaged))}")
         for shard in damaged:
-            (folder / shard_name(shard)).unlink(missing_ok=True)  # another process may have removed it
+            (folder / made_name(shard)).unlink(missing_ok=True)  # another process may have removed it
         prepare(source, config, folder, sensor, rank, world_size, dataset)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for remark in images.remarks():
         reporting.message(remark)
     if not len(images):
         raise no_usable_scan(source)
-    size = sum(path.stat().st_size for path in folder.glob("*.shard"))
+    size = sum(path.stat().st_size for path in (folder / ARRAYS).rglob("*") if path.is_file())
     shape = images.sensor.height, images.sensor.width
     return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
 
@@ -254,13 +244,23 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, in
     write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
 
 
+def _sweep(folder: Path) -> None:
+    """Remove what processes that were killed have left: locks of shards, and files of the library half-written."""
+    for shard in filter(Path.is_dir, (folder / MADE_FOLDER).glob("*")):
+        shard.rmdir()
+    for left in (folder / ARRAYS).rglob("*.__lock"):
+        left.unlink()
+
+
 def _take_back(folder: Path) -> None:
     """Remove a plan of which nothing has been made, so that a corrected command is not refused as another.
 
     A machine that still works by the plan holds the folder, and keeps it.
     """
     with suppress(OutputError, OSError), claim_folder(folder):
-        if not any(path.suffix in (".shard", ".unfinished") for path in folder.iterdir()):
+        if not (folder / ARRAYS).exists():
+            if (folder / MADE_FOLDER).is_dir():
+                (folder / MADE_FOLDER).rmdir()
             for name in (PLAN_FILE, SCANS_FILE):
                 (folder / name).unlink(missing_ok=True)
 
@@ -272,28 +272,4 @@ def _other(differing: Sequence[str]) -> str:
 
 
 def _is_whole(folder: Path, spec: PreparedSpec, shard: int) -> bool:
-    path = folder / shard_name(shard)
-    try:
-        entries, left_out = read_index(LocalBytes(path), path.name)
-    except (OSError, ValueError):  # ValueError: an empty file, and our own errors
-        return False
-    return spec.is_shard(shard, entries, left_out)
-
-
-def _wait_for(folder: Path, spec: PreparedSpec, shards: list[int]) -> None:
-    """Wait until other machines have made their shards."""
-    last = time.monotonic()
-    with reporting.progress("waiting for others", len(shards)) as progress:
-        while shards:
-            still = [shard for shard in shards if not _is_whole(folder, spec, shard)]
-            if len(still) < len(shards):
-                last = time.monotonic()
-                progress.advance(len(shards) - len(still))
-            elif time.monotonic() - last > _PATIENCE_S:
-                raise DataError(
-                    f"{len(still)} shards of {folder} still missing after {_PATIENCE_S / 60:.0f} minutes",
-                    "the other processes to make them",
-                    "see what became of them, or prepare on each where they share no folder; then go on",
-                )
-            shards = still
-            time.sleep(_WAIT_S if still else 0)
+    return PreparedFolder(str(folder)).kept(shard).scans == list(spec.scans_of(shard))

@@ -1,22 +1,25 @@
-"""A prepared folder, on this machine or behind a URL, with a plan and shards → range images."""
+"""A prepared folder, on this machine or behind a URL → range images."""
 
 import copy
-import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
+from lidargrit.core.files import read_json
 from lidargrit.core.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 from lidargrit.data.images import ImageStore, Pixels, Provenance
-from lidargrit.data.prepared.shards import Bytes, LocalBytes, ShardEntry, range_step_m, read_image, read_index
+from lidargrit.data.prepared.arrays import ImageArrays, damaged, range_step_m, store_context, store_errors, store_of
+from lidargrit.data.prepared.plan import PLAN_FILE, PLANES, SCANS_FILE, MadeScans, PreparedSpec, made_name, pixels_name
 from lidargrit.scans.sensors import SensorModel
+
+_OPENED_AT_ONCE = 16  # files: a store takes some hundredths of a second for each
+_LIST_BYTES_AT_MOST = 2**28  # the list of a million scans takes half of it
+_WRITTEN, _AGAIN = "what lidargrit prepare wrote", "prepare it again"
 
 
 class FewerColumns:
@@ -29,7 +32,6 @@ class FewerColumns:
 
     Args:
         images: store of images that are ``columns`` wide.
-        columns: number of columns of the stored images.
         wanted: number of columns of the new images, at most as many.
     """
 
@@ -68,73 +70,6 @@ def has_fewer_columns(sensor: SensorModel, other: SensorModel) -> bool:
         return False
 
 
-PLAN_FILE, SCANS_FILE = "plan.json", "scans.json"
-FORMAT = 4  # to be raised whenever projection or simulation give other pixels for the same scan
-_OPENED_AT_ONCE = 16  # shards: a store takes some hundredths of a second for each
-_LIST_BYTES_AT_MOST = 2**28  # the list of a million scans takes half of it
-
-
-@dataclass(frozen=True)
-class PreparedSpec:
-    """Everything that the pixels of a prepared folder depend on; ``plan.json`` holds it under these names.
-
-    Args:
-        format: number of the format, raised whenever projection or simulation gives other pixels for the same scan.
-        version: version of lidargrit.
-        source: source of the scans, as the user typed it.
-        sensor: JSON of the sensor, with all its fine columns.
-        variant: projection variant, ``exact`` or ``reference``.
-        bad_points: treatment of bad points, ``refuse`` or ``drop``.
-        bad_scans: treatment of bad scans, ``refuse`` or ``skip``.
-        max_scans: largest number of scans taken from the source, evenly spaced; 0 for all.
-        range_step_m: step in which ranges are kept, in metres.
-        shard_scans: number of scans in a shard; the last shard may have fewer.
-        num_scans: number of scans in the folder, those left out included.
-        digest: hash of the names, sizes and times of the scans' files.
-    """
-
-    format: int
-    version: str
-    source: str
-    sensor: dict[str, Any]
-    variant: str
-    bad_points: str
-    bad_scans: str
-    max_scans: int
-    range_step_m: float
-    shard_scans: int
-    num_scans: int
-    digest: str
-
-    @property
-    def num_shards(self) -> int:
-        """Number of shards."""
-        return -(-self.num_scans // self.shard_scans)
-
-    def scans_of(self, shard: int) -> range:
-        """Return the indices of one shard's scans among all scans."""
-        return range(shard * self.shard_scans, min((shard + 1) * self.shard_scans, self.num_scans))
-
-    def is_shard(self, shard: int, entries: Iterable[ShardEntry], left_out: Iterable[int]) -> bool:
-        """Return whether an index, of images and of scans that were left out, is that of a shard."""
-        return sorted([*(entry.scan for entry in entries), *left_out]) == list(self.scans_of(shard))
-
-    def differences(self, other: "PreparedSpec") -> list[str]:
-        """Return the names of the fields that differ from another's."""
-        mine, theirs = asdict(self), asdict(other)
-        return [name for name in mine if mine[name] != theirs[name]]
-
-
-def shard_name(shard: int) -> str:
-    """Return the file name of a shard."""
-    return f"{shard:06d}.shard"
-
-
-def unfinished_name(shard: int) -> str:
-    """Return the name of the file that holds the finished part of a shard."""
-    return f"{shard:06d}.unfinished"
-
-
 def is_prepared(source: str) -> bool:
     """Return whether a source is where prepared scans lie: a URL, or a folder with a plan."""
     try:
@@ -147,30 +82,13 @@ class PreparedFolder:
     """The files of a prepared folder, on this machine or behind a URL.
 
     Args:
-        location: path on this machine, or a URL that fsspec opens, such as s3://bucket/scans.
+        location: path on this machine, or a URL of S3, Google Cloud Storage or HTTP, such as s3://bucket/scans.
     """
 
     def __init__(self, location: str) -> None:
-        self.location = location
         self._is_local = "://" not in location
-        if not self._is_local:
-            import fsspec  # noqa: PLC0415  only for what is far away
-
-            try:
-                self._files, self._root = fsspec.core.url_to_fs(location)
-            except (ValueError, ImportError, OSError) as error:
-                raise DataError(f"{location} ({error})", "a URL that fsspec can open", "check it") from None
-
-    def open(self, name: str) -> Bytes:
-        """Open a file, of which pieces can then be read."""
-        if not self._is_local:
-            return _RemoteBytes(self._files, f"{self._root}/{name}", f"{self.location}/{name}")
-        try:
-            return LocalBytes(user_path(self.location) / name)
-        except (OSError, ValueError) as error:  # an empty file cannot be mapped
-            raise DataError(
-                f"{self.location}/{name}, which cannot be read ({error})", "what lidargrit prepare wrote", "prepare it"
-            ) from None
+        self.location = str(user_path(location)) if self._is_local else location.rstrip("/")
+        self._store = store_of(self.location)
 
     def read_json(self, name: str, kind: type = dict, at_most: int = JSON_BYTES_AT_MOST) -> Any:
         """Read a whole JSON file of bounded size and depth.
@@ -179,60 +97,48 @@ class PreparedFolder:
             kind: required type of the whole, dict or list.
             at_most: largest size, in bytes.
         """
-        file = self.open(name)
-        data, wanted = bytes(file.read(0, min(file.size, at_most + 1))), "what lidargrit prepare wrote"
-        return parse_json(data, f"{self.location}/{name}", kind, DataError, wanted, "prepare again", at_most)
+        if self._is_local:
+            return read_json(Path(self.location, name), kind, DataError, _WRITTEN, _AGAIN, at_most)
+        import tensorstore  # noqa: PLC0415  quick start of commands that read no prepared scans
+
+        location = f"{self.location}/{name}"
+        with store_errors(location):
+            found = tensorstore.KvStore.open(self._store, context=store_context(True)).result().read(name).result()
+        if found.state != "value":
+            raise DataError(f"{location}, which does not exist", _WRITTEN, "prepare it, or check the URL")
+        return parse_json(found.value, location, kind, DataError, _WRITTEN, _AGAIN, at_most)
 
     def read_spec(self) -> PreparedSpec:
         """Read what the images were prepared from and how, or raise DataError."""
+        entries = self.read_json(PLAN_FILE)
         try:
-            entries = self.read_json(PLAN_FILE)
-            spec = PreparedSpec(**entries)
-            for field in fields(PreparedSpec):  # the plain types; the sensor checks itself
-                kind = {int: int, float: (int, float), str: str}.get(field.type, dict)
-                if not isinstance(getattr(spec, field.name), kind) or isinstance(getattr(spec, field.name), bool):
-                    raise TypeError(f"{field.name} is {getattr(spec, field.name)!r:.40}")
-            if spec.format != FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
-                raise TypeError(f"format {spec.format}, {spec.num_scans} scans by {spec.shard_scans}")
-            return spec
+            return PreparedSpec.from_json(entries)
         except TypeError as error:
-            raise DataError(
-                f"{self.location}/{PLAN_FILE}, which is no plan ({error})", "one of this version", "prepare again"
-            ) from None
+            got = f"{self.location}/{PLAN_FILE}, which is no plan ({error})"
+            raise DataError(got, "one of this version", "prepare into another folder") from None
+
+    def read_made(self, shard: int) -> MadeScans:
+        """Read which scans of a shard are made, or raise DataError."""
+        content = self.read_json(made_name(shard))
+        try:
+            return MadeScans.from_json(content)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise damaged(f"{self.location}/{made_name(shard)}", str(error)) from None
+
+    def kept(self, shard: int) -> MadeScans:
+        """Return what is there of a shard on this machine; nothing where one of its files is lost or damaged."""
+        try:
+            made = self.read_made(shard)
+            files = {name: Path(self.location, pixels_name(name, shard)) for name in PLANES}
+            sizes = {name: file.stat().st_size for name, file in files.items() if file.is_file()}
+        except (DataError, OSError):
+            return MadeScans()
+        return made if sizes == made.file_bytes else MadeScans()
 
 
 def _is_named(scan: Any) -> bool:
     """Return whether an entry of the list of scans begins with the scan's name and its recording."""
     return isinstance(scan, list) and len(scan) >= 2 and isinstance(scan[0], str) and isinstance(scan[1], str)
-
-
-class _RemoteBytes:
-    """A file in a store that fsspec knows, such as an S3 bucket."""
-
-    def __init__(self, files: Any, path: str, url: str) -> None:
-        self._files, self._path, self._url = files, path, url
-        with self._store_errors():
-            self.size = int(files.info(path)["size"])
-
-    def read(self, start: int, end: int) -> bytes:
-        """Return the bytes from ``start`` up to ``end``."""
-        with self._store_errors():  # by keyword: some stores have a version of the file before the start
-            return self._files.cat_file(self._path, start=start, end=end)
-
-    @contextmanager
-    def _store_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except FileNotFoundError:
-            raise DataError(
-                f"{self._url}, which does not exist", "what lidargrit prepare wrote", "prepare it, or check the URL"
-            ) from None
-        except Exception as error:  # the library of every store has errors of its own
-            raise DataError(
-                f"{self._url}, which cannot be read ({type(error).__name__}: {error})",
-                "a store that can be reached with your credentials",
-                "check its address and the credentials, then give the same command again",
-            ) from None
 
 
 class PreparedImages:
@@ -252,39 +158,40 @@ class PreparedImages:
                 f"{range_step_m(self.sensor):g} m",
                 "prepare again",
             )
-        self._shape = (self.sensor.height, self.sensor.width)
-        self._entries: list[tuple[int, ShardEntry]] = []
-        self.left_out: dict[int, str] = {}
-        self._open: dict[int, Bytes] = {}
-        self._lock = threading.Lock()
         scans = self._folder.read_json(SCANS_FILE, list, _LIST_BYTES_AT_MOST)
         if len(scans) != self.spec.num_scans or not all(map(_is_named, scans)):
-            raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", "prepare again")
+            raise DataError(f"{location}/{SCANS_FILE}, which is damaged", "the scans of the plan", _AGAIN)
         with ThreadPoolExecutor(_OPENED_AT_ONCE) as pool:
-            indices = list(pool.map(self._read_index, range(self.spec.num_shards)))
-        for shard, (entries, left_out) in enumerate(indices):
-            if not self.spec.is_shard(shard, entries, left_out):
-                raise DataError(f"{shard_name(shard)} with other scans", "those of the plan", "prepare again")
-            self._entries += [(shard, entry) for entry in entries]
-            self.left_out |= left_out
+            made = list(pool.map(self._folder.read_made, range(self.spec.num_shards)))
+        for shard, here in enumerate(made):
+            if here.scans != list(self.spec.scans_of(shard)):
+                raise DataError(f"{location}/{made_name(shard)} with other scans", "those of the plan", _AGAIN)
+        self._arrays = ImageArrays(self._folder.location, self.spec)
+        self._images = [image for here in made for image in here.images]
+        self.left_out = {scan: why for here in made for scan, why in here.left_out.items()}
         # What some scans lack, none has: a batch has it of all of its images or of none, whichever they are.
-        self._has_reflectance = all(entry.reflectance_bytes for _, entry in self._entries)
-        self._has_labels = all(entry.label_bytes for _, entry in self._entries)
+        self._planes = ("range",)
+        if all(image.has_reflectance for image in self._images):
+            self._planes += ("reflectance",)
+        if all(image.has_labels for image in self._images):
+            self._planes += ("label",)
         self.provenance = Provenance(
-            tuple(scans[entry.scan][0] for _, entry in self._entries),
-            tuple(scans[entry.scan][1] for _, entry in self._entries),
-            tuple(entry.fingerprint for _, entry in self._entries),
-            tuple(entry.range_fingerprint for _, entry in self._entries),
+            tuple(scans[image.scan][0] for image in self._images),
+            tuple(scans[image.scan][1] for image in self._images),
+            tuple(image.fingerprint for image in self._images),
+            tuple(image.range_fingerprint for image in self._images),
         )
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._images)
 
     def remarks(self) -> list[str]:
         """Tell for a person which scans were left out, and what is read of none since some lack it."""
         told = [f"left out: {why}" for why in self.left_out.values()]
-        for what, has in (("reflectance", "reflectance_bytes"), ("labels", "label_bytes")):
-            lacking = [at for at, (_, entry) in enumerate(self._entries) if not getattr(entry, has)]
+        lacks = [("reflectance", [not image.has_reflectance for image in self._images])]
+        lacks += [("labels", [not image.has_labels for image in self._images])]
+        for what, lack in lacks:
+            lacking = [at for at, lacks_it in enumerate(lack) if lacks_it]
             if 0 < len(lacking) < len(self):
                 which = f"{len(lacking)} of {len(self)} scans, such as {self.provenance.names[lacking[0]]}"
                 told.append(f"WARNING: no {what} in {which}, so that no scan is read with {what}")
@@ -292,11 +199,11 @@ class PreparedImages:
 
     def doubts(self) -> tuple[str, ...]:
         """Return a sentence if the reflectance of some scans was divided by another number than that of others."""
-        scales = Counter(entry.full_scale for _, entry in self._entries if entry.full_scale)
+        scales = Counter(image.full_scale for image in self._images if image.full_scale)
         if len(scales) < 2:
             return ()
         rare = min(scales, key=scales.__getitem__)
-        at = next(at for at, (_, entry) in enumerate(self._entries) if entry.full_scale == rare)
+        at = next(at for at, image in enumerate(self._images) if image.full_scale == rare)
         divided = " and ".join(f"by {scale:,} in {counted_scans(count)}" for scale, count in scales.most_common())
         return (
             f"reflectance divided {divided}, such as {self.provenance.names[at]}, as the largest value of each scan "
@@ -306,7 +213,7 @@ class PreparedImages:
     def evenly_spaced(self, count: int) -> "PreparedImages":
         """Return so many of the images, evenly spaced, without opening the folder again."""
         chosen, whole, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
-        chosen._entries = [self._entries[index] for index in indices]
+        chosen._images = [self._images[index] for index in indices]
         chosen.provenance = Provenance(
             *(
                 tuple(of[index] for index in indices)
@@ -350,23 +257,8 @@ class PreparedImages:
             index: number of the image.
             verify: whether to compare the pixels with their fingerprint.
         """
-        shard, entry = self._entries[index]
-        name = f"{self._folder.location}/{shard_name(shard)}"
-        pixels = read_image(self._bytes(shard), entry, self._shape, self.spec.range_step_m, name, verify)
-        kept = {"reflectance": self._has_reflectance, "label": self._has_labels}
-        return Pixels(pixels.range_m, {name: plane for name, plane in pixels.planes.items() if kept[name]})
+        return self._arrays.read(self._images[index], self._planes, verify)
 
     def shard_of(self, index: int) -> int:
         """Return the number of the shard that holds an image."""
-        return self._entries[index][0]
-
-    def _read_index(self, shard: int) -> tuple[list[ShardEntry], dict[int, str]]:
-        return read_index(self._bytes(shard), shard_name(shard))
-
-    def _bytes(self, shard: int) -> Bytes:
-        with self._lock:
-            if shard in self._open:
-                return self._open[shard]
-        file = self._folder.open(shard_name(shard))  # not under the lock: a store takes a while to answer
-        with self._lock:
-            return self._open.setdefault(shard, file)
+        return self._images[index].scan // self.spec.shard_scans

@@ -12,32 +12,66 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+
+import numpy as np
 
 from lidargrit.core import errors, reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import DataError, LidarGritError, ScanError
+from lidargrit.core.errors import DataError, HeldError, LidarGritError, OutputError, ScanError
+from lidargrit.core.files import claim_folder, write_json
 from lidargrit.core.processes import module_command
 from lidargrit.data.datasets import ScanDataset, open_dataset
-from lidargrit.data.prepared.prepared import PreparedFolder, PreparedSpec, shard_name, unfinished_name
-from lidargrit.data.prepared.shards import LocalBytes, ShardWriter
+from lidargrit.data.prepared.arrays import ImageArrays, facts_of, stored
+from lidargrit.data.prepared.plan import ARRAYS, PLANES, MadeScans, PreparedSpec, made_name, pixels_name
+from lidargrit.data.prepared.prepared import PreparedFolder
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
 
+_WAIT_S = 0.5  # before looking again whether a shard is there that another process makes
 _KEEP_EVERY_S = 5.0  # what a killed process loses at most; a shard of real scans takes about as long
 
 
 def make_shards(folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int) -> None:
-    """Make shards, in this process if one is enough, else in several."""
+    """Make shards, in this process if one is enough, else in several; shards that another machine makes are waited for.
+
+    Args:
+        shards: numbers of the shards that are missing, in the order in which this machine takes them.
+    """
     total = sum(len(spec.scans_of(shard)) for shard in shards)
     workers = min(workers, len(shards))
     with reporting.progress("projecting scans", spec.num_scans, spec.num_scans - total) as progress:
         if workers <= 1:
-            for shard in shards:
-                make_shard(folder, spec, shard, dataset, progress.advance)
+            _make_free_shards(folder, spec, shards, dataset, progress.advance)
             return
-        for count in _made_by_processes(folder, [shards[first::workers] for first in range(workers)]):
+        starts = [len(shards) * number // workers for number in range(workers)]
+        for count in _made_by_processes(folder, [shards[start:] + shards[:start] for start in starts]):
             progress.advance(count)
+
+
+def _make_free_shards(
+    folder: Path,
+    spec: PreparedSpec,
+    shards: list[int],
+    dataset: ScanDataset,
+    advance: Callable[[int], None],
+    is_wanted: Callable[[], bool] = lambda: True,
+) -> None:
+    """Make each shard that nobody else is making, until all are there: that of a process that died is free again."""
+    files = PreparedFolder(str(folder))
+    while shards := [shard for shard in shards if files.kept(shard).scans != list(spec.scans_of(shard))]:
+        is_waiting = True
+        for shard in shards:
+            if not is_wanted():
+                return
+            with suppress(HeldError), claim_folder((folder / made_name(shard)).with_suffix("")):
+                if files.kept(shard).scans != list(spec.scans_of(shard)):
+                    make_shard(folder, spec, shard, dataset, advance)
+                is_waiting = False
+        time.sleep(_WAIT_S if is_waiting else 0)
 
 
 def make_shard(
@@ -54,10 +88,7 @@ def make_shard(
     wanted = evenly_spaced(spec.max_scans or len(dataset), len(dataset))
     if len(wanted) != spec.num_scans:
         raise DataError(f"{len(wanted)} scans in {spec.source}", f"the {spec.num_scans} planned", "prepare again")
-    sensor = SensorModel.from_json(spec.sensor)
-    unfinished, writer = folder / unfinished_name(shard), ShardWriter(spec.range_step_m)
-    with suppress(OSError, ValueError):  # not there, or damaged
-        writer.add_from(LocalBytes(unfinished), unfinished.name)
+    sensor, writer = SensorModel.from_json(spec.sensor), ShardWriter(folder, spec, shard)
     advance(len(writer.scans))
     kept_at = time.monotonic()
     for index in sorted(set(spec.scans_of(shard)) - writer.scans):
@@ -73,10 +104,72 @@ def make_shard(
             writer.add(index, image, scan.full_scale)
         advance(1)
         if time.monotonic() - kept_at > _KEEP_EVERY_S:
-            writer.write(unfinished)
+            writer.keep()
             kept_at = time.monotonic()
-    writer.write(folder / shard_name(shard))
-    unfinished.unlink(missing_ok=True)
+    writer.keep()
+
+
+class ShardWriter:
+    """Images of one shard, collected in memory and now and then written; it goes on from what is there already.
+
+    Args:
+        folder: prepared folder.
+        spec: plan of the folder.
+        shard: number of the shard.
+    """
+
+    def __init__(self, folder: Path, spec: PreparedSpec, shard: int) -> None:
+        self._path, self._spec = folder / made_name(shard), spec
+        self._files = {name: folder / pixels_name(name, shard) for name in PLANES}
+        self._arrays = ImageArrays(str(folder), spec)
+        kept, self._waiting = PreparedFolder(str(folder)).kept(shard), dict[int, dict[str, np.ndarray]]()
+        self._made = kept if set(kept.scans) <= set(spec.scans_of(shard)) else MadeScans()
+        if not self._made.scans:  # what is there may be damaged, and could not be added to
+            for file in self._files.values():
+                file.unlink(missing_ok=True)
+
+    @property
+    def scans(self) -> set[int]:
+        """Indices of the scans that have been added or left out."""
+        return set(self._made.scans)
+
+    def add(self, scan: int, image: RangeImage, full_scale: int = 0) -> None:
+        """Add the image of a scan; for ``full_scale`` see :class:`lidargrit.data.prepared.plan.ImageFacts`."""
+        self._waiting[scan] = planes = stored(image, self._spec.range_step_m)
+        self._made.images.append(facts_of(scan, planes, full_scale))
+
+    def leave_out(self, scan: int, why: str) -> None:
+        """Note that a scan cannot be used."""
+        self._made.left_out[scan] = why
+
+    def keep(self) -> None:
+        """Write what was added: first the pixels, then the file by which they count.
+
+        Raises:
+            OutputError: the disk is full or the folder cannot be written to.
+        """
+        try:
+            if self._waiting:
+                self._write_waiting()
+        except OSError as error:
+            wanted, cure = "a folder with room that may be written to", "free some space, then give the command again"
+            raise OutputError(f"'{error}' while writing {self._path.parent.parent}", wanted, cure) from None
+        self._made.file_bytes = {name: file.stat().st_size for name, file in self._files.items() if file.is_file()}
+        write_json(self._path, asdict(self._made))
+
+    def _write_waiting(self) -> None:
+        group = self._path.parent.parent / ARRAYS / "zarr.json"
+        if not group.is_file():
+            write_json(group, {"zarr_format": 3, "node_type": "group", "attributes": {"sensor": self._spec.sensor}})
+        first, last = min(self._waiting), max(self._waiting)
+        planes = dict[str, np.ndarray]()
+        for scan, of_image in self._waiting.items():
+            for name, pixels in of_image.items():
+                if name not in planes:
+                    planes[name] = np.zeros((last - first + 1, *pixels.shape), pixels.dtype)
+                planes[name][scan - first] = pixels
+        self._arrays.write(first, planes)
+        self._waiting = {}
 
 
 def _made_by_processes(folder: Path, shares: list[list[int]]) -> Iterator[int]:
@@ -131,10 +224,8 @@ def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     try:
         spec = PreparedFolder(str(folder)).read_spec()
         dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
-        for shard in shards:
-            if os.getppid() != parent:
-                return 1  # whoever wanted the shards is gone
-            make_shard(folder, spec, shard, dataset, lambda count: print(count, flush=True))
+        told = partial(print, flush=True)
+        _make_free_shards(folder, spec, shards, dataset, told, lambda: os.getppid() == parent)
     except LidarGritError as error:
         print(json.dumps({"error": [type(error).__name__, error.got, error.wanted, error.cure]}), flush=True)
         return 2

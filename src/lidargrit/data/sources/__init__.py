@@ -34,7 +34,6 @@ class DatasetSource(Source):
     """Scans of a data set: files in a known layout, or simulated scans.
 
     Args:
-        text: name of the source.
         bad_points: treatment of NaN, infinite and origin points.
     """
 
@@ -148,8 +147,6 @@ class TensorSource(Source):
     """A folder of samples as another program writes them, in files of tensors.
 
     Args:
-        text: name of the source.
-        folder: folder of ``.pth`` files.
         samples_format: name of the sample format; recognised from the first file if empty.
     """
 

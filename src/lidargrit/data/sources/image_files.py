@@ -27,13 +27,7 @@ _POINT_COLUMNS_AT_MOST = 5  # x, y, z, reflectance, ring: what is wider is an im
 
 
 class ImageFileSource(Source):
-    """Range images as ``.npy``, in metres, 0 or what is not finite where nothing returned.
-
-    Args:
-        text: name of the source.
-        folder: file, or folder that was named.
-        paths: files, in their order.
-    """
+    """Range images as ``.npy``, in metres, 0 or what is not finite where nothing returned."""
 
     kind = "range images"
 

@@ -13,11 +13,7 @@ from lidargrit.scans.types import RangeImage, Scan
 
 
 class MemorySource(Source):
-    """Scans that a caller holds.
-
-    Args:
-        scans: points of each scan.
-    """
+    """Scans that a caller holds."""
 
     kind = "scans in memory"
 

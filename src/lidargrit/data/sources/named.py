@@ -121,7 +121,6 @@ class ImageScans(NamedScans):
     """Range images as scans.
 
     Args:
-        names: name of each.
         numbers: numbers of those that are taken.
     """
 

@@ -44,14 +44,7 @@ class WholeImages(FeatureExtractor[RangeImage]):
 
 
 class ImageKind(NamedTuple):
-    """What range images must have in common to be compared.
-
-    Args:
-        height: number of rows.
-        width: number of columns.
-        range_min_m: shortest range of the sensor in metres.
-        range_max_m: longest range of the sensor in metres.
-    """
+    """What range images must have in common to be compared."""
 
     height: int
     width: int

@@ -30,8 +30,6 @@ class Protocol:
         source: paper or program (with its commit) that the protocol follows.
         sensor: name of the sensor whose rays the images have; that of the samples or of the scans if empty.
         columns: number of columns of the full circle; the sensor's own if 0.
-        column_stride: step between the columns that are kept.
-        variant: definition of the projection of real scans.
         range_m: open interval of range in metres, outside which a return of either set counts as no return; the
             sensor's own limits if None.
         num_scans: number of scans of each set; as many as there are if 0.

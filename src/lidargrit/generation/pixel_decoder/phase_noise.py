@@ -29,9 +29,6 @@ class PhaseNoise(nn.Module):
     common, and one that pixels beside one another have; the common ones decay with the distance. The shares are learned
     in training, from how the residuals of neighbours in one phase correlate.
 
-    Args:
-        phases: the phases of the mask.
-
     Source:
         Sklar's theorem for the copula; Kibble, An extension of a theorem of Mehler's on Hermite polynomials, 1945.
     """

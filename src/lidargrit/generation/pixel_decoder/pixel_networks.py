@@ -62,7 +62,6 @@ class LatticeNetwork(Network):
 
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _HALVINGS_AT_MOST = 8  # of one side alone
-_MAY_BE_0 = ("column_halvings", "row_halvings", "coarse_range_width")
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _DECODED_LOG_SCALE_M = -3.0  # 5 cm
 

@@ -47,7 +47,6 @@ class CurveVqvaeConfig(TokenizerConfig):
         row_strides: number of rows of each level that become one row at the next coarser level, 1 or 2; columns are
             always halved.
         residual_blocks: number of residual blocks of each encoder level; a decoder level has one more.
-        code_dim: length of a code.
         num_codes: number of codes in the codebook.
         range_encoding: map from metres to [-1, 1]; LiDM's models with ``*`` in their names have the linear one.
         range_scale: encoded range that becomes 1: log2(1 + range in metres), or metres for the linear encoding. 5.84

@@ -32,7 +32,6 @@ class NearestRangeConfig(TokenizerConfig):
 
     Args:
         cell_rows: number of rows of the cell of pixels that a token stands for.
-        cell_columns: number of columns of that cell.
         part_rows: number of parts into which the rows of a cell are divided.
         part_columns: number of parts into which its columns are divided.
         levels: number of different ranges, evenly apart in the logarithm between the sensor's limits.

@@ -59,7 +59,6 @@ class VqvaeConfig(TokenizerConfig):
         cell_columns: number of columns of the cell of pixels that a token stands for; 0 for as many as rows. With fewer
             than rows, the first levels halve rows alone: a pole then fills its cell from side to side.
         residual_blocks: number of residual blocks of each encoder level; a decoder level has one more.
-        code_dim: length of a code.
         num_codes: number of codes in the codebook.
         dropout: probability of dropout within residual blocks.
         padding: values beyond the first and the last column: ``zero`` as in the reference; ``wrap`` closes the circle

@@ -96,11 +96,7 @@ class Fill(Task):
 
 @dataclass(frozen=True, eq=False)
 class AddRows(Task):
-    """Add the rows that a sensor with few of them lacks.
-
-    Args:
-        scans_sensor: sensor that made the scans.
-    """
+    """Add the rows that a sensor with few of them lacks."""
 
     scans_sensor: SensorModel
     verb: ClassVar[str] = "upsample"

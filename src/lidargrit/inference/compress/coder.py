@@ -32,7 +32,6 @@ class StepMixture:
 
     Args:
         mixture: mixtures of n ranges in 64 bits, as a network gives them.
-        rounding: rounding of their numbers.
     """
 
     def __init__(self, mixture: RangeMixture, rounding: Rounding, steps: RangeSteps) -> None:

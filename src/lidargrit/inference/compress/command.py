@@ -27,7 +27,6 @@ class Compressed:
     """Size and content of a file of compressed scans.
 
     Args:
-        num_scans: number of scans.
         num_returns: number of returns of all scans.
         num_bytes: size of the whole file in bytes.
     """

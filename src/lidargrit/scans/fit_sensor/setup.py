@@ -1,12 +1,14 @@
 """Scans and the rays of their sensor → the set-up of the unit that made them, as far as planes tell it."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float64
 
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.scans.projection import project
+from lidargrit.core.errors import ScanError
+from lidargrit.scans.projection import project_by_what_fits
 from lidargrit.scans.sensors import SensorModel, SensorSetup
 from lidargrit.scans.surface_patches import range_noise, row_offsets, row_readings
 from lidargrit.scans.types import RangeImage, Scan
@@ -33,8 +35,11 @@ def fit_setup(scans: Sequence[Scan], sensor: SensorModel) -> tuple[SensorSetup |
         sensor: rays of the sensor, with every column that it fires.
     """
     chosen = evenly_spaced(_SCANS_AT_MOST, len(scans))
-    images = [project(scans[index], sensor) for index in chosen]
-    noise = range_noise(images)
+    images = []
+    for index in chosen:
+        with suppress(ScanError):  # a scan that lacks rings still told the rows of others
+            images.append(project_by_what_fits(scans[index], sensor, partial=True)[0])
+    noise = range_noise(images) if images else None
     if noise is None:
         return None, ()
     height_m = _height_m([scans[index] for index in chosen])

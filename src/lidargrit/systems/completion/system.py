@@ -40,9 +40,6 @@ class CompletionObjective(Objective):
 
     Every scan has a random pattern: rows, all but a sector or a box, or single pixels. Scans are weighed by the square
     root of their hidden share.
-
-    Args:
-        network: network that is trained.
     """
 
     additions = frozenset({"labels", "reflectance"})
@@ -140,11 +137,7 @@ def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -
 
 @dataclass(frozen=True)
 class CompletionConfig(Settings):
-    """The network, which is the whole system.
-
-    Args:
-        completion: sizes of the network that completes scans.
-    """
+    """The network, which is the whole system."""
 
     completion: CompletionNetworkConfig = field(default_factory=CompletionNetworkConfig)
 

@@ -43,8 +43,6 @@ class Synthesis(nn.Module):
     to the image.
 
     Args:
-        latent_dim: length of a latent.
-        widths: channels of each level.
         size: rows and columns of the image, multiples of 16, with at least 32 rows.
         logits: number of maps of return logits beside the range; 0 for none.
 
@@ -75,10 +73,6 @@ class Discriminator(nn.Module):
     """An encoded range image → the logit of its being real.
 
     It sees the image blurred along columns and blurred along rows, which hides single missing pixels.
-
-    Args:
-        widths: channels of each level.
-        size: rows and columns of the image.
 
     Source:
         As :class:`Synthesis`; the blur is that of Kaneko and Harada, NR-GAN, CVPR 2020.

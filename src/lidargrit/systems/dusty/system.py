@@ -19,7 +19,6 @@ from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.published import read_checkpoint
@@ -27,7 +26,7 @@ from lidargrit.nn.random import normal_latents, rngs_of
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.projection import RangeEncoding
-from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import MaskDecoding, RangeImage
 from lidargrit.systems.dusty.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
 from lidargrit.systems.dusty.differentiable_augmentation import (
@@ -61,7 +60,6 @@ _LOGITS: dict[DustyVariant, int] = {"dusty_1": 1, "dusty_2": 2, "baseline": 0}  
 _TOLERANCE: dict[DustyVariant, float] = {"dusty_1": 0.0, "dusty_2": 0.0, "baseline": 0.008}  # of the program
 _NO_RETURN = -1.0  # as an encoded range; the same as a return at the far limit
 
-_PUBLISHED_SENSOR = "hdl64e_kitti_odometry"
 _PUBLISHED_BYTES_AT_MOST = 2**29  # weights, their average and the optimiser of a published model take 350 MB
 
 
@@ -73,7 +71,6 @@ class DustyConfig(Settings):
         variant: form of the published model. ``dusty_1`` drops every ray by a probability of its own; ``dusty_2`` also
             keeps or drops the scan as a whole; ``baseline`` generates a range image with its holes, and far pixels are
             read as no return.
-        latent_dim: length of a latent.
         channels: channels of the finest level of both networks; each of the four coarser levels has twice as many.
         max_channels: largest number of channels of any level.
         penalty_weight: gamma of the penalty on the discriminator's gradient at real images (R1).
@@ -169,9 +166,31 @@ class Dusty(Generator[DustyConfig, DustySampling]):
         return Cost(1, flops_of(self.synthesis, (1, self.config.latent_dim)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: DustyConfig, sensor: SensorModel) -> "Dusty":
-        """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
-        return load_published(files[0], sensor)
+    def read_published(
+        cls, files: Sequence[Path], config: DustyConfig, sensor: SensorModel
+    ) -> tuple[DustyConfig, dict[str, dict[str, Tensor]]]:
+        """Read one checkpoint, whose weights determine the variant and the number of channels.
+
+        Such a file is a dictionary saved by torch. Only ``G_ema`` is read, the moving average of the generator's
+        weights, whose names lidargrit.systems.dusty.dcgan translates.
+
+        Source:
+            kazuto1011/dusty-gan@0374a5e (MIT), trainers/dcgan_amp.py and utils/__init__.py.
+        """
+        weights = from_published(read_checkpoint(files[0], ("G_ema",), _PUBLISHED_BYTES_AT_MOST))
+        try:
+            logits = weights["return_head.weight"].shape[1] if "return_head.weight" in weights else 0
+            read = DustyConfig(
+                variant=next(name for name, count in _LOGITS.items() if count == logits),
+                latent_dim=weights["project.weight"].shape[0],
+                channels=weights["range_head.weight"].shape[0],
+                max_channels=weights["project.weight"].shape[1],
+                penalty_every=1,
+            )
+        except (KeyError, IndexError, StopIteration):
+            got = f"{files[0]}, whose 'G_ema' is no generator of DUSty v1"
+            raise CheckpointError(got, "one that its program saved", "check the path") from None
+        return read, {"synthesis": weights}
 
     def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         return self._generate(self._search(images, images.return_mask, seeds, sampling), seeds, sampling)
@@ -299,35 +318,6 @@ class AdversarialObjective(Objective):
 
     def _augment(self, images: Tensor, rng: torch.Generator) -> Tensor:
         return augment_differentiably(images, self.config.augmentations, (), rng)
-
-
-def load_published(path: Path, sensor: SensorModel | None = None) -> Dusty:
-    """Make a generator of a checkpoint that the authors published, or that their program saved.
-
-    Such a file is a dictionary saved by torch. Only ``G_ema`` is read, the moving average of the generator's weights,
-    whose names lidargrit.systems.dusty.dcgan translates. The weights determine the variant and the number of channels.
-    The program's images have the columns and rows of ``sensor``.
-
-    Source:
-        kazuto1011/dusty-gan@0374a5e (MIT), trainers/dcgan_amp.py and utils/__init__.py.
-    """
-    weights = from_published(read_checkpoint(path, ("G_ema",), _PUBLISHED_BYTES_AT_MOST))
-    try:
-        logits = weights["return_head.weight"].shape[1] if "return_head.weight" in weights else 0
-        config = DustyConfig(
-            variant=next(name for name, count in _LOGITS.items() if count == logits),
-            latent_dim=weights["project.weight"].shape[0],
-            channels=weights["range_head.weight"].shape[0],
-            max_channels=weights["project.weight"].shape[1],
-            penalty_every=1,
-        )
-    except (KeyError, IndexError, StopIteration):
-        raise CheckpointError(
-            f"{path}, whose 'G_ema' is no generator of DUSty v1", "one that its program saved", "check the path"
-        ) from None
-    generator = Dusty(config, sensor or load_sensor(_PUBLISHED_SENSOR))
-    load_exactly(generator, {f"synthesis.{name}": weight for name, weight in weights.items()}, path)
-    return generator.eval()
 
 
 def _widths(config: DustyConfig) -> Widths:

@@ -1,14 +1,18 @@
 """LidarGAN's two convolutional networks, and the losses of GAN and VAE: latents → images, images → vectors."""
 
+from pathlib import Path
 from typing import Annotated, Literal
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.errors import CheckpointError
 from lidargrit.core.typed_values import Bounds
 from lidargrit.nn.blocks import Network
+from lidargrit.nn.published import read_checkpoint
 
 IMAGE_CHANNELS = 2  # horizontal distance and height
+_BYTES_AT_MOST = 1 << 29  # the largest published network takes 120 MB
 
 AdversarialLoss = Literal["relativistic", "plain"]
 
@@ -25,10 +29,8 @@ class Decoder(Network):
     the program's.
 
     Args:
-        latent_dim: length of a latent.
         channels: number of channels of the finest level; each of the three coarser levels has twice as many.
         size: rows and columns of the image; see lidargrit.systems.lidargan.filled_rows.
-        initial_std: standard deviation of new weights.
 
     Source:
         Caccia et al., Deep Generative Modeling of LiDAR Data, IROS 2019; sizes from
@@ -58,10 +60,7 @@ class Encoder(Network):
     Its convolutions are those of :class:`Decoder` in the opposite order.
 
     Args:
-        outputs: number of numbers.
         channels: number of channels of the finest level; each of the three coarser levels has twice as many.
-        size: rows and columns of the image.
-        initial_std: standard deviation of new weights.
     """
 
     def __init__(self, outputs: int, channels: int, size: tuple[int, int], initial_std: float = 0.02) -> None:
@@ -146,6 +145,27 @@ def vae_loss(
     return {"loss": loss, "absolute_error": error.detach(), "kl_nats": kl.detach().mean()}
 
 
-def without_counters(weights: dict[str, Tensor], module: nn.Module) -> dict[str, Tensor]:
-    """Return weights with the module's own counters of batches, which files of old programs lack and nothing reads."""
-    return weights | {name: of for name, of in module.state_dict().items() if name.endswith("num_batches_tracked")}
+def read_published_sizes(path: Path, what: str, first: str, image: str) -> tuple[dict[str, Tensor], int, int]:
+    """Read a file of weights that LidarGAN's program saved, which tells its own sizes.
+
+    The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car reaches,
+    which the largest coordinate of many scans is next to.
+
+    Args:
+        what: network that the file holds, in words.
+        first: name of the decoder's first layer.
+        image: name of the layer at the image, of the decoder or the encoder.
+
+    Returns:
+        weights by their names, length of a latent, and number of channels of the finest level.
+    """
+    weights = read_checkpoint(path, (), _BYTES_AT_MOST)
+    try:
+        (latent_dim, *_), (channels, image_channels, *_) = (weights[f"{name}.weight"].shape for name in (first, image))
+    except (KeyError, ValueError):
+        got = f"{path}, which holds no {what} of LidarGAN's authors"
+        raise CheckpointError(got, "one that their program saved", "check the path") from None
+    if image_channels != IMAGE_CHANNELS:
+        got = f"{path}, whose images have {image_channels} coordinates"
+        raise CheckpointError(got, "distance and height", "use another file")
+    return weights, latent_dim, channels

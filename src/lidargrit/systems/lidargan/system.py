@@ -10,34 +10,27 @@ from torch import Tensor
 from torch.func import functional_call
 
 from lidargrit.core.configuration import Settings
-from lidargrit.core.errors import CheckpointError
 from lidargrit.core.typed_values import Count
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import normal_latents
-from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargan.filled_rows import FilledRows
 from lidargrit.systems.lidargan.networks import (
-    IMAGE_CHANNELS,
     AdversarialLoss,
     Decoder,
     Encoder,
     InitialStd,
     discriminator_loss,
     generator_loss,
-    without_counters,
+    read_published_sizes,
 )
-
-_BYTES_AT_MOST = 1 << 29  # the published network takes 16 MB
 
 
 @dataclass(frozen=True)
@@ -45,7 +38,6 @@ class LidarGanConfig(Settings):
     """Networks and loss of LidarGAN; the defaults are the published ones.
 
     Args:
-        latent_dim: length of a latent.
         channels: number of channels of the finest level of both networks; each of the three coarser levels has twice as
             many.
         rows: number of rows that are generated: 24, 40, 56 or more in steps of 16.
@@ -116,30 +108,12 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         return Cost(1, flops_of(self.decoder, (1, self.config.latent_dim)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarGanConfig, sensor: SensorModel) -> "LidarGan":
-        """Make a generator of one file of weights, such as ``gen_999.pth``, which tells its own sizes.
-
-        The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
-        reaches, which the largest coordinate of many scans is next to.
-        """
-        (path,) = files
-        weights = read_checkpoint(path, (), _BYTES_AT_MOST)
-        try:
-            (latent_dim, *_), (channels, image_channels, *_) = (
-                weights[f"main.{layer}.weight"].shape for layer in (0, 12)
-            )
-        except (KeyError, ValueError):
-            raise CheckpointError(
-                f"{path}, which holds no generator of LidarGAN", "one that its program saved", "check the path"
-            ) from None
-        if image_channels != IMAGE_CHANNELS:
-            raise CheckpointError(
-                f"{path}, which generates {image_channels} coordinates", "distance and height", "use another file"
-            )
-        with numbers_of_file(files[0]):
-            generator = cls(LidarGanConfig(latent_dim, channels, config.rows, config.first_row, config.loss), sensor)
-        load_exactly(generator.decoder, without_counters(weights, generator.decoder), path)
-        return generator.eval()
+    def read_published(
+        cls, files: Sequence[Path], config: LidarGanConfig, sensor: SensorModel
+    ) -> tuple[LidarGanConfig, dict[str, dict[str, Tensor]]]:
+        """Read one file of weights, such as ``gen_999.pth``; see :func:`read_published_sizes`."""
+        weights, latent_dim, channels = read_published_sizes(files[0], "generator", "main.0", "main.12")
+        return LidarGanConfig(latent_dim, channels, config.rows, config.first_row, config.loss), {"decoder": weights}
 
 
 class LidarGanObjective(Objective):

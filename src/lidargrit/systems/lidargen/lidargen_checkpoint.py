@@ -8,7 +8,6 @@ Source:
 """
 
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,24 +21,13 @@ _PARTS, _WEIGHTS, _AVERAGE = 5, 0, 4
 _SIGMAS = "module.sigmas"
 
 
-class LidarGenCheckpoint(NamedTuple):
-    """Sizes, noise levels and weights in a checkpoint.
+def read_lidargen_checkpoint(path: Path) -> tuple[int, int, Tensor, dict[str, Tensor]]:
+    """Read a checkpoint; no network is built, and no code in the file is run.
 
-    Args:
-        channels: number of channels of the finest level.
-        image_channels: number of channels of an image.
-        sigmas: noise levels of the training, the largest first.
-        weights: moving average of the weights, under the names of lidargrit.systems.lidargen.ncsn.
+    Returns:
+        number of channels of the finest level, and of an image; noise levels, the largest first; and the moving average
+        of the weights, under the names of lidargrit.systems.lidargen.ncsn.
     """
-
-    channels: int
-    image_channels: int
-    sigmas: Tensor
-    weights: dict[str, Tensor]
-
-
-def read_lidargen_checkpoint(path: Path) -> LidarGenCheckpoint:
-    """Read sizes, noise levels and weights; no network is built, and no code in the file is run."""
     try:
         parts = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(parts, (list, tuple)) or len(parts) != _PARTS:
@@ -57,7 +45,7 @@ def read_lidargen_checkpoint(path: Path) -> LidarGenCheckpoint:
         raise CheckpointError(
             f"{path}, {why}", "a checkpoint of LiDARGen's authors or of their program", "check which program saved it"
         ) from None
-    return LidarGenCheckpoint(len(weights["begin_conv.weight"]), len(weights["end_conv.weight"]), sigmas, weights)
+    return (len(weights["begin_conv.weight"]), len(weights["end_conv.weight"]), sigmas, weights)
 
 
 def _refuse_other_levels(sigmas: Tensor) -> None:

@@ -24,10 +24,7 @@ class TorusConvolution(nn.Conv2d):
     """A 3x3 convolution that keeps the size and wraps both axes around.
 
     Args:
-        inputs: number of input channels.
-        outputs: number of output channels.
         dilation: distance in pixels between neighbouring weights.
-        bias: whether a bias is added.
     """
 
     def __init__(self, inputs: int, outputs: int, dilation: int = 1, bias: bool = True) -> None:
@@ -82,9 +79,7 @@ class NcsnBlock(Block):
     """Norm, ELU, convolution, twice, plus the input.
 
     Args:
-        inputs: number of input channels.
         outputs: number of output channels; another number than ``inputs`` needs ``down``.
-        dilation: dilation of the convolutions.
         down: whether the block begins a stage: it changes the number of channels and halves the size, or, if dilated,
             keeps the size; its shortcut is a convolution.
     """
@@ -109,12 +104,7 @@ class NcsnBlock(Block):
 
 
 class ResidualUnits(nn.ModuleDict):
-    """Units of ELU, convolution, ELU, convolution, each of them added to its input.
-
-    Args:
-        channels: number of channels.
-        units: number of units.
-    """
+    """Units of ELU, convolution, ELU, convolution, each of them added to its input."""
 
     def __init__(self, channels: int, units: int) -> None:
         names = [f"{unit}_{stage}_conv" for unit in range(1, units + 1) for stage in (1, 2)]
@@ -133,7 +123,6 @@ class Fusion(nn.Module):
 
     Args:
         inputs: number of channels of each input.
-        outputs: number of output channels.
     """
 
     def __init__(self, inputs: tuple[int, ...], outputs: int) -> None:
@@ -169,7 +158,6 @@ class Refinement(Block):
 
     Args:
         inputs: number of channels of each input.
-        outputs: number of output channels.
         units: number of residual units at the end.
 
     Source:
@@ -195,7 +183,6 @@ class Ncsn(Network):
     """The score of noisy images, which is the gradient of their log density.
 
     Args:
-        image_channels: number of channels of an image.
         channels: number of channels of the finest level, twice as many in the others; 128 are published.
     """
 

@@ -17,10 +17,8 @@ from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.reflectance import reflectance_of_returns
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.random import SeededNoise
-from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
@@ -173,26 +171,17 @@ class LidarGen(Generator[LidarGenConfig, LangevinSampling]):
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel) -> "LidarGen":
-        """Make a generator of one checkpoint, which tells its sizes and noise levels."""
-        (path,) = files
-        read = read_lidargen_checkpoint(path)
-        if read.image_channels not in (1, 2):
-            raise CheckpointError(
-                f"{path} for images of {read.image_channels} channels", "range, or range and reflectance", "use another"
-            )
-        read_config = LidarGenConfig(
-            channels=read.channels,
-            reflectance=read.image_channels > 1,
-            sigma_largest=float(f"{float(read.sigmas[0]):.6g}"),
-            sigma_smallest=float(f"{float(read.sigmas[-1]):.6g}"),
-            levels=len(read.sigmas),
-            steps_each=config.steps_each,
-        )
-        with numbers_of_file(path):
-            generator = cls(read_config, sensor)
-        load_exactly(generator, {f"network.{name}": tensor for name, tensor in read.weights.items()}, path)
-        return generator.eval()
+    def read_published(
+        cls, files: Sequence[Path], config: LidarGenConfig, sensor: SensorModel
+    ) -> tuple[LidarGenConfig, dict[str, dict[str, Tensor]]]:
+        """Read one checkpoint, which tells its sizes and noise levels."""
+        channels, image_channels, sigmas, weights = read_lidargen_checkpoint(files[0])
+        if image_channels not in (1, 2):
+            got, wanted = f"{files[0]} for images of {image_channels} channels", "range, or range and reflectance"
+            raise CheckpointError(got, wanted, "use another")
+        largest, smallest = (float(f"{float(sigmas[at]):.6g}") for at in (0, -1))
+        sizes = (channels, image_channels > 1, largest, smallest, len(sigmas), config.steps_each)
+        return LidarGenConfig(*sizes), {"network": weights}
 
     def _counts(self, sampling: LangevinSampling) -> tuple[Float[Tensor, "levels"], int]:
         levels = self.config.levels if sampling.levels is None else sampling.levels

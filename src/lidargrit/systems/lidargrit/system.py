@@ -25,7 +25,6 @@ from lidargrit.generation.tokens import (
     TokenObjective,
 )
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import rngs_of, sample_index
 from lidargrit.nn.transformer import CausalTransformer
@@ -40,7 +39,6 @@ _PUBLISHED_NETWORKS = {  # by our name: the program's name, and entries of its c
     "tokenizer": ("VQ", ("loss.*",)),  # a discriminator and an image network, whose terms have the weight 0
     "transformer": ("Transformer", ("*.attn.mask",)),  # a triangle of ones
 }
-_COUNTERS = ("quantize.usage", "quantize.code_sums")  # of our training, which other programs do not keep
 _GUIDANCE_AT_MOST = 100  # far beyond what is of use, and safe in 32 bits
 
 
@@ -196,8 +194,10 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         self._prepared, self._one_at_a_time = None, threading.Lock()
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel) -> "LidarGrit":
-        """Make a generator of a VQ-VAE's and a transformer's checkpoint, in which weights have the names of ours.
+    def read_published(
+        cls, files: Sequence[Path], config: LidarGritConfig, sensor: SensorModel
+    ) -> tuple[LidarGritConfig, dict[str, dict[str, Tensor]]]:
+        """Read the checkpoints of a VQ-VAE and a transformer, in which weights have the names of ours.
 
         The files tell neither the number of attention heads nor the order of tokens: only the order of the paper, row
         by row over the whole image, is known here.
@@ -205,13 +205,11 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         Source:
             hamedhaghighi/LidarGRIT@a3f86e7, models/base_model.py.
         """
-        generator = cls(config, sensor)
-        for (part, (name, ignored)), path in zip(_PUBLISHED_NETWORKS.items(), files, strict=True):
-            network = generator.get_submodule(part)
-            weights = read_checkpoint(path, (name,), _PUBLISHED_BYTES_AT_MOST, ignored)
-            counters = {ours: of for ours, of in network.state_dict().items() if ours in _COUNTERS}
-            load_exactly(network, weights | counters, path)
-        return generator.eval()
+        networks = {
+            part: read_checkpoint(path, (name,), _PUBLISHED_BYTES_AT_MOST, ignored)
+            for (part, (name, ignored)), path in zip(_PUBLISHED_NETWORKS.items(), files, strict=True)
+        }
+        return config, networks
 
 
 class _Prepared(NamedTuple):

@@ -10,36 +10,29 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.core.configuration import COUNTS_SCANS, Settings
-from lidargrit.core.errors import CheckpointError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Weight
 from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.processes import num_processes
-from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import normal_latents
-from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargan.filled_rows import FilledRows
 from lidargrit.systems.lidargan.networks import (
-    IMAGE_CHANNELS,
     Decoder,
     Encoder,
     InitialStd,
     kl_nats,
+    read_published_sizes,
     vae_loss,
-    without_counters,
 )
-
-_BYTES_AT_MOST = 1 << 29  # the largest published network takes 120 MB
 
 
 @dataclass(frozen=True)
@@ -169,32 +162,14 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         return normal_latents(seeds, *count, self.config.latent_dim).to(self.device)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidarVaeConfig, sensor: SensorModel) -> "LidarVae":
-        """Make a generator of one file of weights, such as ``gen_299.pth``, which tells its own sizes.
-
-        The file does not tell the scale of the images: it is 41.1245 m, the farthest that the box around the car
-        reaches, which the largest coordinate of many scans is next to.
-        """
-        (path,) = files
-        weights = read_checkpoint(path, (), _BYTES_AT_MOST)
-        try:
-            (latent_dim, *_), (channels, image_channels, *_) = (
-                weights[name].shape for name in ("decode.main.0.weight", "encode.main.0.weight")
-            )
-        except (KeyError, ValueError):
-            raise CheckpointError(
-                f"{path}, which holds no autoencoder of LidarGAN's authors", "one of their program", "check the path"
-            ) from None
-        if image_channels != IMAGE_CHANNELS:
-            raise CheckpointError(
-                f"{path}, which encodes {image_channels} coordinates", "distance and height", "use another file"
-            )
-        sizes = (latent_dim, channels, config.rows, config.first_row)
-        with numbers_of_file(files[0]):
-            generator = cls(LidarVaeConfig(*sizes, config.warmup_scans, config.free_nats), sensor)
-        weights |= {"image.scale_m": generator.image.scale_m}
-        load_exactly(generator, without_counters(weights, generator), path)
-        return generator.eval()
+    def read_published(
+        cls, files: Sequence[Path], config: LidarVaeConfig, sensor: SensorModel
+    ) -> tuple[LidarVaeConfig, dict[str, dict[str, Tensor]]]:
+        """Read one file of weights, such as ``gen_299.pth``; see :func:`read_published_sizes`."""
+        names = ("decode.main.0", "encode.main.0")
+        weights, latent_dim, channels = read_published_sizes(files[0], "autoencoder", *names)
+        sizes = (latent_dim, channels, config.rows, config.first_row, config.warmup_scans, config.free_nats)
+        return LidarVaeConfig(*sizes), {"": weights}
 
 
 class LidarVaeObjective(Objective):

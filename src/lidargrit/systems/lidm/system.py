@@ -19,7 +19,6 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.tokenizers import CodebookTokenizer, Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.generation.tokenizers.curve_vqvae import CurveVqvaeConfig
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.published import read_checkpoint, weights_below
 from lidargrit.nn.random import SeededNoise
@@ -42,7 +41,6 @@ class LatentAxes(nn.Module):
 
     Args:
         code_dim: number of channels of a latent.
-        axes: number of axes.
     """
 
     mean: Tensor
@@ -129,6 +127,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
     """
 
     Config = LidmConfig
+    trains = (("tokenizer", "tokenizer"), ("denoiser", "denoiser"))
     facts = SystemFacts(
         generates="range and raydrop, the latter as its tokenizer decodes it",
         paper="Ran et al., Towards Realistic Scene Generation with LiDAR Diffusion Models, CVPR 2024",
@@ -168,11 +167,6 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         """Return 2 steps."""
         return LidmSampling(steps=2)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The tokenizer, then the denoiser of its latents."""
-        return ("tokenizer", "denoiser")
-
     def objective(self, stage: str) -> Objective:
         """Return the tokenizer itself, or the denoising of its latents."""
         if stage == "tokenizer":
@@ -184,14 +178,12 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         return LatentDenoising(self.tokenizer, self.denoiser, scale, self._shares(), axes)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
-        """Take over a stage's trained weights."""
+        """Take over a stage's trained weights, and the scale or the axes of the latents that it saw."""
+        super().load_stage(stage, objective)
         if isinstance(objective, LatentDenoising):
-            self.denoiser.load_state_dict(objective.denoiser.state_dict())
             self.latent_scale.copy_(objective.latent_scale)
             if self.axes is not None and objective.axes is not None:
                 self.axes.load_state_dict(objective.axes.state_dict())
-        else:
-            self.tokenizer.load_state_dict(objective.state_dict())
 
     def get_tokenizer(self) -> Tokenizer:
         """Return the tokenizer, from whose codes every sampled scan is decoded."""
@@ -215,15 +207,17 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         return Cost(steps + 1, flops)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: LidmConfig, sensor: SensorModel) -> "Lidm":
-        """Make a generator of one checkpoint, which holds both networks and tells whether there is a mask channel.
+    def read_published(
+        cls, files: Sequence[Path], config: LidmConfig, sensor: SensorModel
+    ) -> tuple[LidmConfig, dict[str, dict[str, Tensor]]]:
+        """Read one checkpoint, which holds both networks and tells whether there is a mask channel.
 
         Other sizes are the configuration's. The moving average of the denoiser's weights is taken, or the weights
         themselves where the file has none. No file of the authors could be tried: the layout is their program's.
         """
         (path,) = files
         found = read_checkpoint(path, ("state_dict",), _PUBLISHED_BYTES_AT_MOST, _NOT_READ)
-        first_stage = weights_below(found, _FIRST_STAGE)
+        first_stage, denoiser = weights_below(found, _FIRST_STAGE), weights_below(found, _RAW)
         last_layer = first_stage.get("decoder.conv_out.weight")
         if last_layer is None or last_layer.ndim != 4 or not isinstance(config.tokenizer, CurveVqvaeConfig):
             raise CheckpointError(
@@ -231,16 +225,12 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
                 "a checkpoint of LiDM's diffusion model, which holds its first stage too",
                 "check the path, and use the preset lidm_kitti_360",
             )
+        if averaged := weights_below(found, _AVERAGE):  # under the same names without dots
+            names = {f"diffusion_model{name.replace('.', '')}": name for name in denoiser}
+            denoiser = {names.get(name, name): tensor for name, tensor in averaged.items()}
         tokenizer = replace(config.tokenizer, mask_head=len(last_layer) > 1)
-        generator = cls(replace(config, tokenizer=tokenizer, scale_latents=False), sensor)
-        # The program's average names weights without dots.
-        averaged = weights_below(found, _AVERAGE)
-        plain = {f"diffusion_model{name.replace('.', '')}": name for name in generator.denoiser.state_dict()}
-        denoiser = {plain.get(name, name): tensor for name, tensor in averaged.items()} or weights_below(found, _RAW)
-        counts = generator.tokenizer.quantize.named_buffers(prefix="quantize")  # of which the program keeps none
-        load_exactly(generator.tokenizer, first_stage | dict(counts), path)
-        load_exactly(generator.denoiser, denoiser, path)
-        return generator.eval()
+        read = replace(config, tokenizer=tokenizer, scale_latents=False)
+        return read, {"tokenizer": first_stage, "denoiser": denoiser}
 
     def _shares(self) -> Float[Tensor, "1000"]:
         return latent_diffusion.signal_shares()

@@ -20,11 +20,7 @@ from lidargrit.scans.types import RangeImage
 
 @dataclass(frozen=True)
 class MultiscaleConfig(Settings):
-    """The networks of the pixel decoder, which is the whole system.
-
-    Args:
-        pixels: sizes of the pixel decoder.
-    """
+    """The networks of the pixel decoder, which is the whole system."""
 
     pixels: PixelDecoderConfig = field(default_factory=PixelDecoderConfig)
 

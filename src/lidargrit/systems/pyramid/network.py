@@ -45,10 +45,6 @@ class ParentNetwork(Network):
     the next coarser level made of all coarser ones.
 
     Args:
-        rows: number of rows of the coarser level.
-        width: number of channels.
-        blocks: number of residual blocks.
-        features: number of channels of each pixel.
         coarser: number of channels of the network of the next coarser level; 0 for the coarsest of these networks.
     """
 
@@ -78,8 +74,6 @@ class Level(nn.Module):
     """One level of the pyramid: its pixels, given those of all coarser levels.
 
     Args:
-        sensor: rays of the level's images.
-        config: sizes of its pixel decoder.
         parent: network over the coarser levels; None for the coarsest, which is given nothing.
     """
 

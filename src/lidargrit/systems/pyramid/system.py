@@ -166,7 +166,6 @@ class PyramidObjective(Objective):
 
     Args:
         levels: the levels, the finest first.
-        sensor: sensor of the scans.
     """
 
     reaches_all_weights = False  # some phases stand for all

@@ -11,7 +11,7 @@ Source:
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
@@ -47,24 +47,14 @@ _FIRST_NAMES = {  # names of the second layout → those of the first, where the
 }
 
 
-class R2dmCheckpoint(NamedTuple):
-    """Sizes and weights in a checkpoint.
-
-    Args:
-        unet: sizes of the network.
-        reflectance: whether it generates reflectance beside the range.
-        weights: moving average of the weights, under the names of lidargrit.systems.r2dm.unet.
-    """
-
-    unet: UnetConfig
-    reflectance: bool
-    weights: dict[str, Tensor]
-
-
-def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
-    """Read sizes and weights; no network is built, and no code in the file is run.
+def read_r2dm_checkpoint(path: Path) -> tuple[UnetConfig, bool, dict[str, Tensor]]:
+    """Read a checkpoint; no network is built, and no code in the file is run.
 
     Only the published form is known: log range, predicted noise, cosine schedule, continuous time, Fourier features.
+
+    Returns:
+        sizes of the network; whether it generates reflectance beside the range; and the moving average of the weights,
+        under the names of lidargrit.systems.r2dm.unet.
     """
     try:
         file = read_everything(path, _BYTES_AT_MOST)
@@ -106,7 +96,7 @@ def read_r2dm_checkpoint(path: Path) -> R2dmCheckpoint:
             _CURE,
         ) from None
     _check_sizes(path, unet, weights)
-    return R2dmCheckpoint(unet, reflectance, weights)
+    return (unet, reflectance, weights)
 
 
 def _check_sizes(path: Path, unet: UnetConfig, weights: dict[str, Tensor]) -> None:

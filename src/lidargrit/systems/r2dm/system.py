@@ -20,12 +20,11 @@ from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
-from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2dm import diffusion
 from lidargrit.systems.r2dm.diffusion import Sampler
@@ -33,7 +32,6 @@ from lidargrit.systems.r2dm.r2dm_checkpoint import read_r2dm_checkpoint
 from lidargrit.systems.r2dm.unet import EfficientUnet, UnetConfig
 
 _BATCH = 8
-_PUBLISHED_SENSOR = "hdl64e_kitti_360"
 _SHARE_SCANS = 1000  # whose returns are counted: more would not change their share
 _CALIBRATION_SEED = 1 << 40  # mixed with a scan's number, so that its seed is none of a user's first
 
@@ -43,7 +41,6 @@ class R2dmConfig(Settings):
     """Channels and network of R2DM.
 
     Args:
-        unet: sizes of the U-Net.
         reflectance: whether reflectance is learned beside the range, as published; set it to false where scans have
             none, or for a sharper range (the authors' own remark).
         calibration_scans: number of scans sampled at the end of training to fit the threshold of the ``calibrated``
@@ -168,9 +165,12 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         return Cost(steps, steps * flops_of(self.network, (1, *self.shape), (1,)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: R2dmConfig, sensor: SensorModel) -> "R2dm":
-        """Make a generator of one checkpoint, which tells its own sizes; see :func:`load_published`."""
-        return load_published(files[0], sensor)
+    def read_published(
+        cls, files: Sequence[Path], config: R2dmConfig, sensor: SensorModel
+    ) -> tuple[R2dmConfig, dict[str, dict[str, Tensor]]]:
+        """Read one checkpoint, which tells its own sizes, in either layout of the authors."""
+        unet, reflectance, weights = read_r2dm_checkpoint(files[0])
+        return R2dmConfig(unet, reflectance), {"network": weights}
 
     @torch.no_grad()
     def _sample_values(self, seeds: Sequence[int], sampling: DiffusionSampling) -> Float[Tensor, "B C H W"]:
@@ -214,18 +214,3 @@ class Denoising(Objective):
         predicted = self.network(diffusion.noised(clean, log_snr, noise), log_snr).float()
         error = (predicted - noise).square().mean((1, 2, 3))
         return {"loss": (error * diffusion.min_snr_weight(log_snr)).mean(), "noise_mse": error.mean()}
-
-
-def load_published(path: Path, sensor: SensorModel | None = None) -> R2dm:
-    """Make a generator from a checkpoint that the authors published, or that their program saved.
-
-    Args:
-        path: checkpoint in either layout of lidargrit.systems.r2dm.r2dm_checkpoint; code in it is not run.
-        sensor: sensor of the images; if not given, that of the KITTI-360 weights, with rows by elevation. The network
-            keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the sensor's.
-    """
-    unet, reflectance, weights = read_r2dm_checkpoint(path)
-    generator = R2dm(R2dmConfig(unet, reflectance), sensor or load_sensor(_PUBLISHED_SENSOR))
-    own = {name: tensor for name, tensor in generator.state_dict().items() if not name.startswith("network.")}
-    load_exactly(generator, own | {f"network.{name}": tensor for name, tensor in weights.items()}, path)
-    return generator.eval()

@@ -34,7 +34,6 @@ class UnetConfig(Settings):
         channel_multipliers: channels of each level over those of the finest, from fine to coarse; each further level
             halves both axes.
         residual_blocks: number of residual blocks of each level, on the way down and again on the way up.
-        norm_groups: number of groups of every group norm.
         attention_heads: number of attention heads of the coarsest level, on both ways.
     """
 
@@ -74,8 +73,6 @@ class EfficientUnet(Network):
 
     Args:
         images: number of channels of the input and of the output.
-        elevation_rad: elevation (H, W) of every pixel in radians.
-        azimuth_rad: azimuth (H, W) of every pixel in radians.
 
     Source:
         Nakashima and Kurazume, R2DM, ICRA 2024, after Saharia et al., Imagen, 2022 (Efficient U-Net); layers and names

@@ -26,12 +26,7 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 
 
 class Solved(NamedTuple):
-    """Where a flow ends.
-
-    Args:
-        images: clean images.
-        evaluations: number of evaluations of the velocity.
-    """
+    """Where a flow ends."""
 
     images: Float[Tensor, "B C H W"]
     evaluations: int

@@ -104,11 +104,6 @@ class HditConfig(Settings):
 class Hdit(Network):
     """Predicts the velocity of range images; azimuth wraps, and attention depends on the rays of the tokens.
 
-    Args:
-        images: number of channels of the images.
-        elevation_rad: elevation of every pixel's ray in radians.
-        azimuth_rad: azimuth of every pixel's ray in radians.
-
     Source:
         Crowson et al., Hourglass Diffusion Transformer, ICML 2024, as changed in Nakashima et al., R2Flow, ICRA 2025
         (kazuto1011/r2flow@3f5afeb, MIT), whose published size has 80,908,420 parameters.

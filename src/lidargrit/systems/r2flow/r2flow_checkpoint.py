@@ -11,7 +11,7 @@ Source:
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
@@ -25,27 +25,15 @@ _WANTED = "a checkpoint of R2Flow's authors or of their train.py"
 _CURE = "check which program saved it, or download it from kazuto1011/r2flow, its releases"
 
 
-class R2flowCheckpoint(NamedTuple):
-    """What a checkpoint tells of its network.
-
-    Args:
-        hdit: sizes of the network.
-        channels: number of channels of an image.
-        distilled_steps: number of equal steps that the flow was distilled to; 0 if it was not.
-        weights: moving average of the weights, under the names of lidargrit.systems.r2flow.hdit.
-    """
-
-    hdit: HditConfig
-    channels: int
-    distilled_steps: int
-    weights: dict[str, Tensor]
-
-
-def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> R2flowCheckpoint:
-    """Read sizes, settings and weights; no network is built, and no code in the file is run.
+def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> tuple[HditConfig, int, int, dict[str, Tensor]]:
+    """Read a checkpoint; no network is built, and no code in the file is run.
 
     Args:
         sensor: sensor whose limits the ranges of the images must have.
+
+    Returns:
+        sizes of the network; number of channels of an image; number of equal steps that the flow was distilled to, 0 if
+        it was not; and the moving average of the weights, under the names of lidargrit.systems.r2flow.hdit.
     """
     try:
         file = read_everything(path, _BYTES_AT_MOST)
@@ -61,7 +49,7 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> R2flowCheckpoint:
     except (KeyError, ValueError, TypeError, ConfigError) as error:
         message = f"{path}, whose weights are of another network ({type(error).__name__}: {error})"
         raise CheckpointError(message, _WANTED, _CURE) from None
-    return R2flowCheckpoint(hdit, channels, steps, weights)
+    return (hdit, channels, steps, weights)
 
 
 def _distilled_steps(path: Path, settings: Any, sensor: SensorModel) -> int:

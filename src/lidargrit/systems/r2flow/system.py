@@ -5,16 +5,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.random import SeededNoise
-from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel, continuous_azimuths_rad
 from lidargrit.scans.types import RangeImage
@@ -38,7 +37,6 @@ class R2flowConfig(Settings):
     """Channels, network and trainings of R2Flow.
 
     Args:
-        hdit: sizes of the network.
         reflectance: whether to learn the reflectance beside the range, as published; false where scans have none.
         reflow: settings of the trainings after the first, which straighten the flow; None for the first alone (1-RF).
     """
@@ -119,18 +117,13 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         return Cost(passes, passes * flops_of(self.network, (1, *self.shape), (1,)))
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: R2flowConfig, sensor: SensorModel) -> "R2flow":
-        """Make a generator of one checkpoint, which tells the sizes of its network, and if its flow was distilled.
-
-        The network keeps the ray angles of its training, at the edges of cells; where a pixel's point lies is the
-        sensor's.
-        """
+    def read_published(
+        cls, files: Sequence[Path], config: R2flowConfig, sensor: SensorModel
+    ) -> tuple[R2flowConfig, dict[str, dict[str, Tensor]]]:
+        """Read one checkpoint, which tells the sizes of its network, and if its flow was distilled."""
         hdit, channels, steps, weights = read_r2flow_checkpoint(files[0], sensor)
         reflow = ReflowConfig(distilled_steps=steps) if steps else None
-        with numbers_of_file(files[0]):
-            generator = cls(R2flowConfig(hdit, channels > 1, reflow), sensor)
-        load_exactly(generator, {f"network.{name}": tensor for name, tensor in weights.items()}, files[0])
-        return generator.eval()
+        return R2flowConfig(hdit, channels > 1, reflow), {"network": weights}
 
     def _solved(self, seeds: Sequence[int], sampling: FlowSampling) -> flow.Solved:
         noise = SeededNoise(seeds, self.shape, self.device)()

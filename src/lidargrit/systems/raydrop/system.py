@@ -33,12 +33,7 @@ _WITHOUT_LABELS = 0.25  # of the scans, so that a network with classes drops ret
 
 
 class RaydropObjective(Objective):
-    """The likelihood of which surfaces return, in phases and pixel by pixel.
-
-    Args:
-        network: network that is trained.
-        sensor: sensor whose raydrop it learns.
-    """
+    """The likelihood of which surfaces return, in phases and pixel by pixel."""
 
     additions = frozenset({"labels", "reflectance"})
     reaches_all_weights = False  # some phases stand for all
@@ -106,11 +101,7 @@ class RaydropObjective(Objective):
 
 @dataclass(frozen=True)
 class RaydropConfig(Settings):
-    """The network, which is the whole system.
-
-    Args:
-        raydrop: sizes of the network of raydrop, and what it learns from.
-    """
+    """The network, which is the whole system."""
 
     raydrop: RaydropNetworkConfig = field(default_factory=RaydropNetworkConfig)
 

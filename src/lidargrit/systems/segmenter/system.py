@@ -57,7 +57,6 @@ class SegmenterNetwork(nn.Module):
     """A small U-Net over the returns of a scan: range, height above the sensor, and elevation of every pixel.
 
     Args:
-        config: sizes of the network.
         sensor: the rays and limits of the range images.
 
     Source:
@@ -112,12 +111,7 @@ _NOISE_M = 0.05  # largest standard deviation of noise added in training, so tha
 
 
 class SegmenterObjective(Objective):
-    """The cross-entropy of the classes of returns; a class counts by the square root of its share of them.
-
-    Args:
-        network: network that is trained.
-        sensor: sensor whose scans it labels.
-    """
+    """The cross-entropy of the classes of returns; a class counts by the square root of its share of them."""
 
     additions = frozenset({"reflectance"})
 
@@ -170,11 +164,7 @@ def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"])
 
 @dataclass(frozen=True)
 class SegmenterConfig(Settings):
-    """The network, which is the whole system.
-
-    Args:
-        segmenter: sizes of the segmenter's network, and what it sees.
-    """
+    """The network, which is the whole system."""
 
     segmenter: SegmenterNetworkConfig = field(default_factory=SegmenterNetworkConfig)
 

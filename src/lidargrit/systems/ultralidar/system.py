@@ -16,12 +16,10 @@ from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
-from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import without_autocast
 from lidargrit.nn.processes import of_first_process, sample_from_all, sum_over_processes
 from lidargrit.nn.random import gumbel_of, sample_index
-from lidargrit.nn.size import numbers_of_file
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
@@ -51,10 +49,6 @@ class CodebookCare(nn.Module):
     The latents of the last hundred steps are kept as a reservoir. When more than 3 % of the codes have not been chosen
     for 256 steps, k-means over the reservoir begins at the codes in use, and at random latents in place of the idle
     ones. It is done at most every 1,000 steps.
-
-    Args:
-        num_codes: number of codes.
-        code_dim: length of a code.
 
     Source:
         myc634/UltraLiDAR_nusc_waymo@eb65fe0 (MIT). Its counter of idle steps begins at 0, as here, so that its k-means
@@ -233,21 +227,15 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         return Cost(sampling.steps + 1 + 3 * rounds, flops)
 
     @classmethod
-    def from_published(cls, files: Sequence[Path], config: UltraLidarConfig, sensor: SensorModel) -> "UltraLidar":
-        """Make a generator of one checkpoint, which tells its own sizes, but not where its cells lie.
+    def read_published(
+        cls, files: Sequence[Path], config: UltraLidarConfig, sensor: SensorModel
+    ) -> tuple[UltraLidarConfig, dict[str, dict[str, Tensor]]]:
+        """Read one checkpoint, which tells its own sizes, but not where its cells lie.
 
-        Args:
-            files: checkpoint of the program; code in it is not run.
-            config: settings that the file does not tell; its grid must have as many cells as the file's.
-            sensor: sensor along whose rays the voxels are seen.
+        The grid of the configuration must have as many cells as the file's.
         """
-        (path,) = files
-        read = read_ultralidar_checkpoint(path, config.autoencoder)
-        with numbers_of_file(path):
-            generator = cls(UltraLidarConfig(read.autoencoder, read.prior, config.flips), sensor)
-        counts = {name: of for name, of in generator.state_dict().items() if name.startswith("autoencoder.quantiser.")}
-        load_exactly(generator, counts | read.weights, path)  # how often codes were used is not in the file
-        return generator.eval()
+        autoencoder, prior, weights = read_ultralidar_checkpoint(files[0], config.autoencoder)
+        return UltraLidarConfig(autoencoder, prior, config.flips), {"": weights}
 
     def _voxels(self, seed: int, sampling: VoxelSampling) -> Bool[Tensor, "1 z y x"]:
         """Sample one scan; seeds do not share a pass, so that none depends on another's."""

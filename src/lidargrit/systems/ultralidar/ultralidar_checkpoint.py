@@ -10,7 +10,6 @@ Source:
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -36,22 +35,10 @@ _TABLES = re.compile(  # what follows from the sizes, or only training uses
 _POSITIONS = "lidar_encoder.pos_embed"
 
 
-class UltraLidarCheckpoint(NamedTuple):
-    """Sizes and weights in a checkpoint.
-
-    Args:
-        autoencoder: sizes of the first stage; its cells are those that the caller gave.
-        prior: sizes of the second stage.
-        weights: weights under the names of lidargrit.systems.ultralidar.system.
-    """
-
-    autoencoder: VoxelAutoencoderConfig
-    prior: SwinConfig
-    weights: dict[str, Tensor]
-
-
-def read_ultralidar_checkpoint(path: Path, sizes: VoxelAutoencoderConfig) -> UltraLidarCheckpoint:
-    """Read sizes and weights; no network is built, and no code in the file is run.
+def read_ultralidar_checkpoint(
+    path: Path, sizes: VoxelAutoencoderConfig
+) -> tuple[VoxelAutoencoderConfig, SwinConfig, dict[str, Tensor]]:
+    """Read the sizes of both stages, and the weights under our names; no network is built, and no code is run.
 
     Args:
         sizes: cells of the model, which the file does not tell.
@@ -80,7 +67,7 @@ def read_ultralidar_checkpoint(path: Path, sizes: VoxelAutoencoderConfig) -> Ult
                 f"{cells[0]} tokens of {cells[1]} layers, as model.autoencoder.grid says",
                 "set model.autoencoder.grid.cells to those of the file",
             )
-        return UltraLidarCheckpoint(autoencoder, _blocks(weights, "prior"), weights)
+        return (autoencoder, _blocks(weights, "prior"), weights)
     except (OSError, RefusedFileError, ConfigError) as why:
         reason = f"whose sizes cannot be: {why.got}" if isinstance(why, ConfigError) else why
         raise CheckpointError(

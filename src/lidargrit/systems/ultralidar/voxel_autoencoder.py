@@ -34,8 +34,6 @@ class VoxelAutoencoderConfig(Settings):
         grid: cells of the box about the sensor.
         patch: number of cells along x and along y that one token stands for, with all cells above each other.
         blocks: sizes of the encoder, and of the decoder.
-        num_codes: number of codes.
-        code_dim: length of a code.
     """
 
     grid: VoxelGrid = field(default_factory=VoxelGrid)

@@ -55,8 +55,6 @@ class VoxelPrior(Network):
     Args:
         config: sizes; 24 blocks are published.
         tokens: number of tokens along y and along x.
-        num_codes: number of codes.
-        code_dim: length of a code.
     """
 
     pos_embed: Tensor

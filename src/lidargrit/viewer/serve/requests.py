@@ -68,9 +68,7 @@ class Example(NamedTuple):
     """A simulated street to try a task on.
 
     Args:
-        words: text of its button on the page.
         sensor: name of the sensor that sees it; "" for that of the model.
-        every_beam_returns: whether no beam is lost.
     """
 
     words: str
@@ -93,7 +91,6 @@ class SamplingSetting:
     """A number that a client may set when a generator samples.
 
     Args:
-        name: name of the field in the generator's ``Sampling``.
         default: default value; None where the generator computes one itself.
         about: description, from the docstring of ``Sampling``.
     """

@@ -30,7 +30,6 @@ class RunningServer(NamedTuple):
     """A server that listens.
 
     Args:
-        run: function that answers requests until Ctrl-C.
         stop: function that ends ``run`` from another thread, and with it all connections.
     """
 

@@ -31,8 +31,6 @@ class Place(NamedTuple):
         start: position of the record in the file.
         length: size of the record, in bytes.
         unpacked: size of a chunk's records once unpacked, in bytes; -1 for a message.
-        first: time of the first message.
-        last: time of the last message.
         channels: channels of its messages; none if they are not known.
     """
 
@@ -49,9 +47,7 @@ class Contents(NamedTuple):
 
     Args:
         schemas: name of each schema's type, by its number.
-        channels: channels by their numbers.
         places: chunks and messages, in the order of the file.
-        counts: number of messages of each channel.
         cut_at: position from which the file cannot be read; 0 if it is whole.
     """
 

@@ -20,12 +20,7 @@ class Property(NamedTuple):
 
 
 class Element(NamedTuple):
-    """An element of a header.
-
-    Args:
-        rows: number of its rows.
-        properties: properties of each row, in order.
-    """
+    """An element of a header."""
 
     name: str
     rows: int

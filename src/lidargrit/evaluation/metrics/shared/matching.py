@@ -14,12 +14,7 @@ Clouds = Float32[np.ndarray, "_ points 3"]
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """For every cloud of a set, the nearest of another set, or of its own set without itself.
-
-    Args:
-        index: index of the nearest cloud in the other set.
-        distance: Chamfer distance to that cloud.
-    """
+    """For every cloud of a set, the nearest of another set, or of its own set without itself."""
 
     index: Int64[np.ndarray, " n"]
     distance: Float64[np.ndarray, " n"]

@@ -34,9 +34,6 @@ class Objects(NamedTuple):
     """Objects of a batch of images, one after the other.
 
     Args:
-        image: index of the image in the batch.
-        kind: index of the kind in :data:`KINDS`.
-        returns: number of returns.
         length_m: longest horizontal extent along one of eight directions.
         height_m: difference between the heights of the highest and the lowest return.
         distance_m: horizontal distance of the nearest return.

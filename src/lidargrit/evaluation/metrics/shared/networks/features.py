@@ -104,12 +104,7 @@ class NormalisedImages:
 
 @dataclass(frozen=True)
 class NetworkFeatures(FeatureExtractor[Float32[np.ndarray, "B d"]]):
-    """The features that a pretrained network finds in images.
-
-    Args:
-        network: the network with its weights.
-        inputs: function that turns range images into the network's inputs.
-    """
+    """The features that a pretrained network finds in images."""
 
     network: PretrainedNetwork
     inputs: UnitClouds | NormalisedImages
