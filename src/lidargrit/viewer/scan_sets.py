@@ -13,6 +13,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, ScanError, no_usable_scan
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
@@ -82,7 +83,7 @@ def load_scan_sets(
     opened = [open_source(source, config.bad_points) for source in sources]
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
     seeds = seeds_in_a_row(seed, count) if runs else range(0)
-    generators = {source.text: load(source.folder).to(chosen) for source in runs}
+    generators = {source.text: load(locate(source.text)).to(chosen) for source in runs}
     named = settings.load_sensor()
     scans_alone = sensor is None and all(isinstance(source, DatasetSource) for source in opened)
     fine = all_columns and scans_alone and not config.columns
