@@ -165,6 +165,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     sensor = _model(name, rows, columns, used, row_of_point, rings, len(used))
     setup, assumed = fit_setup([scans[index] for index in rings.used], sensor)
     sensor = replace(sensor, setup=setup)
+    doubts = (*notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns), *assumed)
     return SensorFit(
         sensor=sensor,
         method=rings.method,
@@ -181,12 +182,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=(
-            *_notes_of(scans),
-            *notes_on_sensor(rows, rings),
-            *_warnings(rows, rings, len(scans), columns),
-            *assumed,
-        ),
+        warnings=(*_notes_of(scans), *doubts),
     )
 
 

@@ -32,8 +32,8 @@ class SensorSetup(Settings):
         farthest_m: range in metres beyond which a data set keeps no return; 0 for the sensor's own limit.
         divergence_mrad: full angle of a beam in milliradians.
         pulse_length_m: distance in metres below which two echoes are heard as one.
-        split_exponent: where a beam is split between surfaces, power counts by the share of the beam that lies on
-            what is heard, raised to this; at 0 each surface answers with its own part of the light alone.
+        split_exponent: exponent of the share of a split beam that lies on the surface that is heard, by which its power
+            is multiplied; at 0 each surface answers with its own part of the light alone.
         glass_passes: share of the light that goes through a pane, which depends on the wavelength.
         reflectance_scale: factor on all reflectances: makers scale them as they like.
         height_m: height above the road, in metres.
