@@ -40,7 +40,7 @@ def same(one, two):
 def test_hits_are_those_of_one_mesh(seed, moves):
     scene = scene_of(seed)
     poses = [scene.sensor_pose(time_s) for time_s in ((0.4, 0.4 + REVOLUTION_S) if moves else (0.4,))]
-    rays = Beams.sample(SENSOR, np.random.default_rng(seed), 0.03).rays(*poses)
+    rays = Beams.sample(SENSOR, np.random.default_rng(seed), 0.0014).rays(*poses)
     objects = scene.objects(0.4)
     assert len(objects) > 40
     whole, kept = Tracer(scene.mesh(0.4), 120.0), Tracer(scene.standing, 120.0, objects)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.scans import classes
@@ -19,7 +20,7 @@ from toy_scene import HEIGHT_M, ToyScene, box, quad, road, street, wall
 
 MODEL = RaydropModel()
 SETUP = SensorSetup(range_sigma_m=0.02, log_gain=PACKAGED["hdl64e_kitti_odometry"].log_gain)
-GAPS = replace(SETUP, gap_share=0.033)
+GAPS = replace(SETUP, firing_jitter_rad=np.pi / 1024 / ndtri(1 - 0.033 / 2))
 SENSOR = replace(load_sensor("hdl64e_kitti_odometry").with_columns(1024), setup=SETUP)
 
 
@@ -114,7 +115,7 @@ def test_gaps_are_part_of_the_probability(seen):
     share = np.mean([s.return_mask[near_wall].mean() for s in seen])
     said = np.mean([s.return_probability[near_wall].mean() for s in seen])
     assert share == pytest.approx(said, abs=0.003)
-    assert said == pytest.approx(1 - GAPS.gap_share, abs=0.003)
+    assert said == pytest.approx(1 - 0.033, abs=0.003)
 
 
 def test_road_is_lost_in_the_distance():

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
+from scipy.special import ndtr, ndtri
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.datasets import open_dataset
@@ -24,8 +25,8 @@ SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(1024)
 ALL_RETURN = RaydropModel(least_power=1e-9, pulse_spread=0.0)
 
 
-def look(*parts, **setup):
-    sensor = replace(SENSOR, setup=SensorSetup(**setup))
+def look(*parts, columns=SENSOR.width, **setup):
+    sensor = replace(SENSOR.with_columns(columns), setup=SensorSetup(**setup))
     streams = (np.random.default_rng(seed) for seed in (0, 1))
     return observe_scene(ToyScene(*parts), sensor, *streams, ObservationConfig(model=ALL_RETURN))
 
@@ -35,7 +36,7 @@ def look(*parts, **setup):
     [
         ({"range_sigma_m": -0.01}, r"got range_sigma_m=-0\.01; wanted a number, at least 0, at most 0\.5"),
         ({"range_sigma_m": float("nan")}, "got range_sigma_m=nan"),
-        ({"gap_share": 0.95}, r"got gap_share=0\.95; wanted a number, at least 0, at most 0\.9"),
+        ({"firing_jitter_rad": 0.2}, r"got firing_jitter_rad=0\.2; wanted a number, at least 0, at most 0\.1"),
         ({"pulse_length_m": 0.0}, "got pulse_length_m=0"),
         ({"glass_passes": 1.5}, "got glass_passes=1.5"),
         ({"height_m": 0.0}, "got height_m=0"),
@@ -121,10 +122,12 @@ def test_height_and_gaps_and_scale():
     for height_m in (1.5, 2.2):
         seen = look(road(), height_m=height_m)
         assert np.allclose((seen.directions[..., 2] * seen.clean_range_m)[50], -height_m, atol=1e-3)
-    wide = look(wall(10.0), gap_share=0.3)
-    at = (wide.clean_range_m > 0) & ~wide.blocked
-    assert wide.return_mask[at].mean() == pytest.approx(0.7, abs=0.01)
-    assert wide.return_probability[at].mean() == pytest.approx(0.7, abs=0.01)
+    jitter_rad = np.pi / SENSOR.width / ndtri(0.85)  # three firings in ten leave columns of this width
+    for columns, share in ((SENSOR.width, 0.3), (SENSOR.width // 2, 2 * ndtr(-2 * ndtri(0.85)))):
+        wide = look(wall(10.0), columns=columns, firing_jitter_rad=jitter_rad)
+        at = (wide.clean_range_m > 0) & ~wide.blocked
+        assert wide.return_mask[at].mean() == pytest.approx(1 - share, abs=0.01)
+        assert wide.return_probability[at].mean() == pytest.approx(1 - share, abs=0.01)
     plain, dim = (look(wall(10.0), reflectance_scale=scale) for scale in (1.0, 0.25))
     read = plain.return_mask & (plain.reflectance > 0.1) & (plain.reflectance < 0.9)
     assert read.any()

@@ -195,11 +195,12 @@ def test_rays_of_tables_and_of_lasers_that_look_aside():
 
 def test_jitter_stays_in_the_column_and_leaves_gaps():
     sensor = load_sensor("hdl64e_kitti_odometry")
-    beams = Beams.sample(sensor, np.random.default_rng(3), 0.033)
+    beams = Beams.sample(sensor, np.random.default_rng(3), 0.000719475)
     column = (np.pi - beams.azimuth_rad.astype(np.float64)) / (2 * np.pi) * 2048
     assert np.array_equal(np.floor(column), np.broadcast_to(np.arange(2048), (64, 2048)))
     assert 0.2 < (column % 1).std() < 0.25
     assert (~beams.fired).mean() == pytest.approx(0.033, abs=0.002)
+    assert beams.gap_share == pytest.approx(0.033, abs=1e-5)
     pairs = ~beams.fired[:, 1:] & ~beams.fired[:, :-1]
     assert pairs.mean() < 0.003  # alone
     assert 0.85 < beams.clear.mean() < 0.95

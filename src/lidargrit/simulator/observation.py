@@ -157,7 +157,7 @@ def observe_scene(
     model, setup = config.model, setup_of(sensor, scene_rng)
     begun, ended = (scene.sensor_pose(config.time_s + after_s, setup.height_m) for after_s in (0.0, REVOLUTION_S))
     poses = (begun, ended) if config.motion else (begun,)
-    beams = Beams.sample(sensor, beam_rng, setup.gap_share)
+    beams = Beams.sample(sensor, beam_rng, setup.firing_jitter_rad)
     height, fine_width = beams.azimuth_rad.shape
     beam_noise = BeamNoise.sample(beam_rng, height, fine_width, model)
     stride = fine_width // sensor.width if config.kept_columns_only else 1
@@ -227,7 +227,7 @@ def _measure(
     log_gain = (lasers.log_gain + beam_noise.patch).ravel() + of_object
     level = levels(echoes.power, log_gain, model)
     clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])
-    probability = np.where(clear, return_probability(level, model, setup.gap_share), np.float32(0))
+    probability = np.where(clear, return_probability(level, model, beams.gap_share), np.float32(0))
     pulse_noise = np.float32(model.pulse_spread) * beam_noise.pulse.ravel()
     sigma_m = range_sigma_m(np.minimum(echoes.range_m, limits_m[1]), echoes.cos_incidence, setup).reshape(shape)
     range_m = echoes.range_m + (lasers.offset_m + sigma_m * beam_noise.range_noise).ravel()

@@ -28,7 +28,8 @@ class SensorSetup(Settings):
         offset_m: constant error of each laser's ranges, in metres.
         log_gain: natural logarithm of each laser's gain in power.
         reading: factor on the reflectance that each laser reports.
-        gap_share: share of the pixels into which no firing falls.
+        firing_jitter_rad: standard deviation of the azimuth at which a laser fires, in radians. A firing that leaves
+            its column leaves a pixel without a return, so narrow columns have gaps and wide ones have none.
         farthest_m: range in metres beyond which a data set keeps no return; 0 for the sensor's own limit.
         divergence_mrad: full angle of a beam in milliradians.
         pulse_length_m: distance in metres below which two echoes are heard as one.
@@ -48,7 +49,7 @@ class SensorSetup(Settings):
     offset_m: Annotated[tuple[_OffsetM, ...], Bounds(0, 4096)] = ()
     log_gain: Annotated[tuple[_LogGain, ...], Bounds(0, 4096)] = ()
     reading: Annotated[tuple[_Factor, ...], Bounds(0, 4096)] = ()
-    gap_share: Annotated[float, Bounds(0, 0.9)] = 0.0
+    firing_jitter_rad: Annotated[float, Bounds(0, 0.1)] = 0.0
     farthest_m: Annotated[float, Bounds(0, 1000)] = 0.0
     divergence_mrad: Annotated[float, Bounds(0, 50)] = 2.0
     pulse_length_m: Annotated[float, Bounds(above=0, most=10)] = 0.75
@@ -81,7 +82,7 @@ class SensorSetup(Settings):
             footprint_sigma=float(rng.uniform(0, 0.06)),
             offset_m=tuple(np.clip(offset_spread_m * rng.standard_normal(height), -0.1, 0.1).tolist()),
             log_gain=tuple(np.clip(gain_spread * rng.standard_normal(height), -2, 2).tolist()),
-            gap_share=float(rng.uniform(0, 0.035)),
+            firing_jitter_rad=float(rng.uniform(0, 0.00072)),
             divergence_mrad=float(rng.uniform(1, 3)),
             pulse_length_m=float(rng.uniform(0.5, 1)),
             split_exponent=float(rng.uniform(0, 12)),

@@ -194,7 +194,7 @@ def _example(example: Example, sensor: SensorModel) -> Scan:
     if not example.every_beam_returns:
         return simulate(_EXAMPLE_SEED, sensor)
     setup = dataclasses.replace(
-        setup_of(sensor, np.random.default_rng(_EXAMPLE_SEED)), gap_share=0.0, split_exponent=0.0
+        setup_of(sensor, np.random.default_rng(_EXAMPLE_SEED)), firing_jitter_rad=0.0, split_exponent=0.0
     )
     return simulate(_EXAMPLE_SEED, dataclasses.replace(sensor, setup=setup), model=RaydropModel(least_power=_NO_POWER))
 
