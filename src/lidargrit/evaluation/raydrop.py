@@ -52,8 +52,8 @@ def evaluate_streets(
         tables, their plain values, and the curves, which can be plotted.
     """
     drops = raydrop_model(model, config.device) if model else None  # refused before anything is simulated
-    source, other = (open_source(word, config.data.bad_points) if word else None for word in (reference, beside))
-    assert source is not None
+    source = open_source(reference, config.data.bad_points)
+    other = open_source(beside, config.data.bad_points) if beside else None
     scans = StreetScans.of(streets, source, config.sensor, config.data_config())
     real, another = scans.real(), other.images(scans.rays, scans.config) if other else None
     simulated = scans.simulated()

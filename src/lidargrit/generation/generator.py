@@ -187,11 +187,13 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return self.sample(seeds, condition, sampling)
 
     @final
-    def stream(self, seeds: Iterable[int], sampling: SamplingT | None = None) -> Iterator[RangeImage]:
+    def stream(
+        self, seeds: Iterable[int], sampling: SamplingT | None = None, condition: Condition = NOTHING
+    ) -> Iterator[RangeImage]:
         """Yield the scans of :meth:`sample` one by one; seeds may be without end, such as ``itertools.count(0)``."""
-        remaining = iter(seeds)
-        while some := list(islice(remaining, self.compute_batch)):
-            images = self.sample(some, sampling=sampling)
+        remaining, size = iter(seeds), self.compute_batch
+        for number, some in enumerate(iter(lambda: list(islice(remaining, size)), [])):
+            images = self.sample(some, condition[number * size : (number + 1) * size], sampling)
             yield from (images[index] for index in range(len(images)))
 
     @abstractmethod

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from itertools import chain, islice
@@ -70,7 +70,7 @@ def write_samples(
     if condition != NOTHING and begun:
         _refuse_other_condition(folder, condition, {seed: where[seed] for seed in where.keys() - {*missing}})
     known = condition[[where[seed] for seed in missing]]
-    images = generator.stream(missing, settings) if known == NOTHING else _sampled(generator, missing, known, settings)
+    images = generator.stream(missing, settings, known)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
         reporting.progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
@@ -88,16 +88,6 @@ def write_samples(
     if seeds and (not is_sample_folder(folder) or _missing(folder, seeds)):
         raise removed_meanwhile(folder)
     remove_partials(folder)
-
-
-def _sampled(
-    generator: Generator[Any, SamplingT], seeds: Sequence[int], condition: Condition, sampling: SamplingT
-) -> Iterator[RangeImage]:
-    """Yield the scans of some seeds, each under its condition."""
-    for first in range(0, len(seeds), generator.compute_batch):
-        some = slice(first, first + generator.compute_batch)
-        images = generator.sample(seeds[some], condition[some], sampling)
-        yield from (images[index] for index in range(len(images)))
 
 
 def _refuse_other_condition(folder: Path, condition: Condition, there: dict[int, int]) -> None:

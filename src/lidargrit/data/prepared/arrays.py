@@ -52,10 +52,10 @@ def store_of(location: str) -> dict[str, Any]:
     Raises:
         DataError: the library cannot open such a URL.
     """
-    import tensorstore  # noqa: PLC0415  quick start of commands that read no prepared scans
-
     if "://" not in location:
         return {"driver": "file", "path": f"{location}/"}
+    import tensorstore  # noqa: PLC0415  quick start of commands that read no prepared scans
+
     try:
         store = tensorstore.KvStore.Spec(f"{location.rstrip('/')}/").to_json()
     except ValueError as error:

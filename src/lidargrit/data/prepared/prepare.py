@@ -59,7 +59,7 @@ def prepare(
     facts = json.dumps({**asdict(spec), "source": ""}, sort_keys=True).encode()  # the digest names the scans
     folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
     _claim(folder, spec, scans)
-    missing = [shard for shard in range(spec.num_shards) if not _is_whole(folder, spec, shard)]
+    missing = PreparedFolder(str(folder)).missing(spec, range(spec.num_shards))
     if not missing:  # a complete folder may be one that this user can only read
         return folder
     try:
@@ -269,7 +269,3 @@ def _other(differing: Sequence[str]) -> str:
     """Name what differs between two plans in words for a person."""
     settings = [f"another {name}" for name in differing if name not in ("digest", "num_scans")]
     return ", ".join([*settings, *(["other scans"] if len(settings) < len(differing) else [])])
-
-
-def _is_whole(folder: Path, spec: PreparedSpec, shard: int) -> bool:
-    return PreparedFolder(str(folder)).kept(shard).scans == list(spec.scans_of(shard))

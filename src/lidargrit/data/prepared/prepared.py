@@ -2,6 +2,7 @@
 
 import copy
 from collections import Counter
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,10 @@ class PreparedFolder:
             return MadeScans()
         return made if sizes == made.file_bytes else MadeScans()
 
+    def missing(self, spec: PreparedSpec, shards: Iterable[int]) -> list[int]:
+        """Return those of some shards that are not there as a whole on this machine."""
+        return [shard for shard in shards if self.kept(shard).scans != list(spec.scans_of(shard))]
+
 
 def _is_named(scan: Any) -> bool:
     """Return whether an entry of the list of scans begins with the scan's name and its recording."""
@@ -188,10 +193,10 @@ class PreparedImages:
     def remarks(self) -> list[str]:
         """Tell for a person which scans were left out, and what is read of none since some lack it."""
         told = [f"left out: {why}" for why in self.left_out.values()]
-        lacks = [("reflectance", [not image.has_reflectance for image in self._images])]
-        lacks += [("labels", [not image.has_labels for image in self._images])]
-        for what, lack in lacks:
-            lacking = [at for at, lacks_it in enumerate(lack) if lacks_it]
+        has = {"reflectance": [image.has_reflectance for image in self._images]}
+        has["labels"] = [image.has_labels for image in self._images]
+        for what, there in has.items():
+            lacking = [at for at, is_there in enumerate(there) if not is_there]
             if 0 < len(lacking) < len(self):
                 which = f"{len(lacking)} of {len(self)} scans, such as {self.provenance.names[lacking[0]]}"
                 told.append(f"WARNING: no {what} in {which}, so that no scan is read with {what}")

@@ -62,13 +62,13 @@ def _make_free_shards(
 ) -> None:
     """Make each shard that nobody else is making, until all are there: that of a process that died is free again."""
     files = PreparedFolder(str(folder))
-    while shards := [shard for shard in shards if files.kept(shard).scans != list(spec.scans_of(shard))]:
+    while shards := files.missing(spec, shards):
         is_waiting = True
         for shard in shards:
             if not is_wanted():
                 return
             with suppress(HeldError), claim_folder((folder / made_name(shard)).with_suffix("")):
-                if files.kept(shard).scans != list(spec.scans_of(shard)):
+                if files.missing(spec, [shard]):
                     make_shard(folder, spec, shard, dataset, advance)
                 is_waiting = False
         time.sleep(_WAIT_S if is_waiting else 0)

@@ -96,7 +96,7 @@ def read_r2dm_checkpoint(path: Path) -> tuple[UnetConfig, bool, dict[str, Tensor
             _CURE,
         ) from None
     _check_sizes(path, unet, weights)
-    return (unet, reflectance, weights)
+    return unet, reflectance, weights
 
 
 def _check_sizes(path: Path, unet: UnetConfig, weights: dict[str, Tensor]) -> None:

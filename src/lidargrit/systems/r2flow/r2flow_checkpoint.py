@@ -49,7 +49,7 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> tuple[HditConfig,
     except (KeyError, ValueError, TypeError, ConfigError) as error:
         message = f"{path}, whose weights are of another network ({type(error).__name__}: {error})"
         raise CheckpointError(message, _WANTED, _CURE) from None
-    return (hdit, channels, steps, weights)
+    return hdit, channels, steps, weights
 
 
 def _distilled_steps(path: Path, settings: Any, sensor: SensorModel) -> int:

@@ -67,7 +67,7 @@ def read_ultralidar_checkpoint(
                 f"{cells[0]} tokens of {cells[1]} layers, as model.autoencoder.grid says",
                 "set model.autoencoder.grid.cells to those of the file",
             )
-        return (autoencoder, _blocks(weights, "prior"), weights)
+        return autoencoder, _blocks(weights, "prior"), weights
     except (OSError, RefusedFileError, ConfigError) as why:
         reason = f"whose sizes cannot be: {why.got}" if isinstance(why, ConfigError) else why
         raise CheckpointError(
