@@ -128,6 +128,21 @@ def test_commands_that_share_a_folder_keep_out_only_those_that_do_not(tmp_path, 
         pytest.fail("it is held by another")
 
 
+def test_a_folder_that_its_last_holder_removes_meanwhile_is_made_again(tmp_path, monkeypatch):
+    folder, is_dir, removed = tmp_path / "out", Path.is_dir, []
+
+    def removed_once(path: Path) -> bool:
+        if path == folder and not removed:
+            removed.append(path.rmdir())
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", removed_once)
+    with claim_folder(folder):
+        write_text(folder / "file.txt", "whole")
+    assert len(removed) == 1
+    assert everything_in(folder) == ["file.txt"]
+
+
 def test_a_claim_that_comes_to_nothing_leaves_no_folder(tmp_path):
     with pytest.raises(KeyError), claim_folder(tmp_path / "new" / "out"):
         raise KeyError

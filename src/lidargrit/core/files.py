@@ -65,7 +65,6 @@ def claim_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     """
     is_new = not folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         lock = _lock(folder, fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
     except OSError as error:
         raise OutputError(
@@ -135,10 +134,11 @@ def _partial_file(folder: Path) -> Iterator[Path]:
 
 
 def _lock(folder: Path, kind: int) -> int:
-    """Lock a folder for this process and return the open lock file."""
+    """Lock a folder for this process, made if it is missing, and return the open lock file."""
     attempts = count(1)
     while True:
-        with _missing(next(attempts)):  # as in _partial_file
+        with _missing(next(attempts)):  # who held it before may have just removed it, empty; else as in _partial_file
+            folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(_hidden(folder) / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
             try:
                 fcntl.flock(lock, kind | fcntl.LOCK_NB)
@@ -171,7 +171,7 @@ def _missing(attempt: int) -> AbstractContextManager[object]:
 def _hidden(folder: Path) -> Path:
     """Return the hidden folder, made if it is missing; it may vanish again at once: see _sweep."""
     if not folder.is_dir():
-        raise OSError("the folder has been removed")
+        raise FileNotFoundError("the folder has been removed")
     hidden = folder / _PARTIALS
     with suppress(FileExistsError):
         hidden.mkdir()

@@ -1,12 +1,14 @@
-"""Scans for other programs: samples, prepared scans or a data set → a folder of point clouds, or a KITTI tree."""
+"""Scans for other programs: samples, prepared scans or a data set → files of points, a KITTI tree, or recordings."""
 
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ConfigError, printable
+from lidargrit.core.errors import ConfigError, ScanError, printable
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.recordings import KINDS, recording_of, write_recording
 from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, writable_format
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
@@ -27,7 +29,7 @@ def export_scans(
     sensor: SensorModel | None = None,
     change: Rescan | UndoMotion | None = None,
 ) -> int:
-    """Write every scan of a source to a file of its own; files that are there already are not written again.
+    """Write every scan of a source to a file of its own, or every drive to a recording; what is there is kept.
 
     Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
     names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
@@ -37,21 +39,25 @@ def export_scans(
         source: samples of ours or of another program, a prepared folder, or a source of scans.
         out: an empty folder, or one that the same command began; more scans can be added to it.
         kind: a format's name or one of its endings ("pcd", "npz", ...), or ``kitti_odometry`` for the tree
-            ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels.
+            ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels;
+            ``mcap`` or ``rrd`` for a recording of each folder of scans, with their times and poses.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
         change: work on each scan before it is written; scans stay as they are if not given.
 
     Returns:
-        Number of scans that are there now.
+        Number of scans, or of recordings, that are there now.
     """
     config = config or DataConfig()
-    layout = KittiTree(out) if kind == TREE else _Flat(out, *writable_format(kind, TREE))
+    others = TREE, *KINDS
+    layout = KittiTree(out) if kind in others else _Flat(out, *writable_format(kind, *others))
     scans, of_images = _open(source, config, sensor)
-    read = scans.scan if change is None else _Changed(scans, change)
+    read = (scans.timed if kind in KINDS else scans.scan) if change is None else _Changed(scans, change)
     scans.check_output(out)
-    files = layout.files([scans.name(index) for index in range(len(scans))])
     facts = {"source": source, "format": kind, **of_images, **(change.identity() if change else {})}
+    if kind in KINDS:
+        return _Recordings(scans, read, kind, config).write(out, facts)
+    files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     with folder.writing("exporting") as progress:
@@ -63,6 +69,50 @@ def export_scans(
                 scans.tell_notes(scan)
             progress.advance(1)
     return folder.num_written
+
+
+class _Recordings:
+    """Scans of a source as recordings, one for each folder of scans.
+
+    Args:
+        read: function that reads a scan, with its time and pose where they are known.
+    """
+
+    def __init__(self, scans: NamedScans, read: Callable[[int], Scan], kind: str, config: DataConfig) -> None:
+        self._scans, self._read, self._kind, self._config = scans, read, kind, config
+        self._drives: dict[str, list[int]] = {}
+        for index in range(len(scans)):
+            self._drives.setdefault(f"{recording_of(scans.name(index))}.{kind}", []).append(index)
+
+    def write(self, out: Path, facts: dict[str, Any]) -> int:
+        """Write those that are missing, and return the number of recordings that are there then."""
+        files, drives = [*self._drives], [*self._drives.values()]
+        holds = [" ".join(self._scans.identity(index) for index in drive) for drive in drives]
+        folder = ScanFolder(out, MANIFEST, facts, files, holds, self._config.bad_scans)
+        left = sum(len(drives[number]) for number in folder.missing)
+        with folder.writing("exporting", left, len(self._scans)) as progress:
+            for number in folder.missing:
+                with folder.leaving_out(number):
+                    usable = self._usable(drives[number], progress.advance)
+                    write_recording(out / files[number], self._kind, usable)
+        return folder.num_written
+
+    def _usable(self, drive: list[int], advance: Callable[[int], None]) -> Iterator[Scan]:
+        is_empty = True
+        for index in drive:
+            try:
+                scan = self._read(index)
+            except ScanError as error:
+                if self._config.bad_scans == "refuse":
+                    raise
+                reporting.message(f"left out: {error}")
+            else:
+                self._scans.tell_notes(scan)
+                is_empty = False
+                yield scan
+            advance(1)
+        if is_empty:
+            raise ScanError(f"no usable scan of {self._scans.name(drive[0])}", "at least one", "leave the drive out")
 
 
 class _Changed:

@@ -73,7 +73,7 @@ class ScanFolder:
         return len(self.files) - len(self._left_out)
 
     @contextmanager
-    def writing(self, what: str, remaining: int | None = None) -> Iterator[Progress]:
+    def writing(self, what: str, remaining: int | None = None, total: int | None = None) -> Iterator[Progress]:
         """Hold the folder while its files are written, and yield the progress to be advanced by each.
 
         At the end, the manifest lists the files that were left out no more. If no scan was written, a new manifest is
@@ -82,8 +82,9 @@ class ScanFolder:
         Args:
             what: name of the work, for the bar.
             remaining: number of scans that it is done with; those that are missing if not given.
+            total: number of scans in all files; one in each if not given.
         """
-        total = len(self.files)
+        total = len(self.files) if total is None else total
         done = total - (len(self.missing) if remaining is None else remaining)
         with (
             claim_folder(self.out),
@@ -92,7 +93,7 @@ class ScanFolder:
         ):
             self._claim()
             yield progress
-            if len(self._left_out) == total:
+            if len(self._left_out) == len(self.files):
                 raise no_usable_scan(self._facts["source"])
             if self._left_out:
                 there = read_json(self._manifest)
