@@ -41,7 +41,7 @@ def test_phases_cover_every_pixel_once(cell: int, halvings: tuple[int, int]) -> 
     assert torch.equal(count, torch.ones_like(count))
     last = sum(halvings)
     assert len(phases) == 1 + 3 * int(math.log2(cell)) + 2 * last
-    before = generated_before(phases, torch.ones(1)).sum((1, 2, 3, 4)).tolist()
+    before = generated_before(phases).sum((1, 2, 3, 4)).tolist()
     assert before[:4] == [0, 1, 2, 3]
     assert before[len(phases) - 2 * last :] == [2, 3] * last
 

@@ -15,7 +15,7 @@ from lidargrit.data.run_folder import PACKAGED
 from lidargrit.data.sources import Source, open_source
 from lidargrit.data.sources.memory import MemorySource
 from lidargrit.data.torch_dataset import TorchDataset
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair
+from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair, open_reference
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import load
 from lidargrit.inference.complete import Model, open_model
@@ -154,6 +154,7 @@ def evaluate(
     Args:
         generated: a folder of samples, of ours or of another program, a source of scans, or scans in memory.
         reference: a set to compare with, of the same kinds; its scans are projected with the sensor of ``generated``.
+            Or a reference file (``evaluate DATA --save-reference``).
         protocol: name of the protocol, which chooses and defines the metrics (``lidargrit list protocols``).
         metrics: names of metrics, instead of the protocol's.
         max_scans: largest number of scans of each set; 0 for the protocol's.
@@ -165,8 +166,8 @@ def evaluate(
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    first, second = (_source(each, sensor) for each in (generated, reference))
-    return compare_pair(open_pair(first, second, settings), settings)
+    real = open_reference(reference, settings) if isinstance(reference, str) else _source(reference, sensor)
+    return compare_pair(open_pair(_source(generated, sensor), real, settings), settings)
 
 
 def _as_scan(points: Points) -> Scan:

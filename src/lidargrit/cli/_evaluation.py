@@ -3,20 +3,26 @@
 import argparse
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
 
+if TYPE_CHECKING:
+    from lidargrit.evaluation.comparison import EvalConfig
+
 _OF_TABLES = ("tables", "table")
 _OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
+_OF_REFERENCE = ("samples", "protocol", "count", "device", *SCANS)
 _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
 def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
     """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
+    from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.evaluation.comparison import compare_sources, read_config
     from lidargrit.evaluation.raydrop import evaluate_streets, streets_of
+    from lidargrit.evaluation.reference_file import ENDING
     from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
@@ -29,7 +35,12 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
         scan_settings(options, max_scans=options.count), **{name: vars(options)[name] for name in names}
     )
     sets = (options.samples, options.reference)
-    streets = streets_of(options.samples, config) if options.reference else None
+    if options.save_reference:
+        refuse_unused(options, "with --save-reference", ("save_reference", *_OF_REFERENCE, *_OF_CARDS))
+        return *_saved(options, config), None
+    if options.report and sets[1].endswith(ENDING):
+        raise ConfigError(f"--report with {sets[1]}, which holds no scan", "scans to show", "leave it out")
+    streets = streets_of(options.samples, config) if options.reference and not sets[1].endswith(ENDING) else None
     if streets is None:
         refuse_unused(options, "without --tables or --protocol streets", (*_OF_BOTH, *_OF_CARDS))
         refuse_to_overwrite(options.report, options.overwrite, ".html")
@@ -41,3 +52,14 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model, options.beside)
     plot = partial(plot_curves, curves, options.report, f"real: {options.reference}") if options.report else None
     return text, values, plot
+
+
+def _saved(options: argparse.Namespace, config: "EvalConfig") -> tuple[str, dict[str, Any]]:
+    """Save what metrics keep of the scans that stand where samples do, and return what the file holds."""
+    from lidargrit.core.files import refuse_to_overwrite
+    from lidargrit.evaluation.comparison import save_reference
+    from lidargrit.evaluation.reference_file import ENDING
+
+    refuse_to_overwrite(options.save_reference, options.overwrite, ENDING)
+    file = save_reference(options.samples, options.save_reference, config)
+    return file.as_text(), file.facts()

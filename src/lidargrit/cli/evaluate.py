@@ -13,6 +13,7 @@ EXAMPLES = """\
   lidargrit evaluate samples kitti_360:/data/kitti_360:test --protocol lidargrit-kitti-360 --json scores.json
   lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
   lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
+  lidargrit evaluate kitti_360:/data/kitti_360:test --protocol r2dm --save-reference test.lgref    scores need no data
   lidargrit evaluate --tables ours.json theirs.json --table markdown
 """
 
@@ -21,7 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     samples = "samples of lidargrit or of another program (.pth), or a source of scans"
     add("samples", nargs="?", default="", help=samples)
-    add("reference", nargs="?", default="", help="scans to compare with; projected with the sensor of the samples")
+    reference = "scans to compare with, projected with the sensor of the samples; or their .lgref"
+    add("reference", nargs="?", default="", help=reference)
     add("--protocol", default="exact", metavar="NAME", help="metrics and definitions: lidargrit list protocols")
     add("--metrics", nargs="+", default=[], metavar="NAME", help="others than its: lidargrit list metrics")
     add("--variant", default="", metavar="NAME", help="published definition of every metric")
@@ -36,8 +38,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scans(parser)
     add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
+    add(
+        "--save-reference",
+        type=Path,
+        metavar="FILE",
+        help="only keep of SAMPLES, real scans, what others score by (.lgref)",
+    )
     add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
-    add_json(parser, "the files of --json and --report")
+    add_json(parser, "the files of --json, --report and --save-reference")
     add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
     add_table(parser)
 

@@ -15,13 +15,14 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import RunSource, Source, open_source
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.metrics import load_metric
-from lidargrit.evaluation.pairs import EvalPair, pair_for_protocol
+from lidargrit.evaluation.pairs import EvalPair, Opened, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
+from lidargrit.evaluation.reference_file import FiledSet, ReferenceFile, reference_file, write_reference
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
-from lidargrit.evaluation.scoring import MetricFactory, score_metrics
+from lidargrit.evaluation.scoring import MetricFactory, keep_real, score_metrics
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.projection import ProjectionVariant
-from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ def compare_sources(samples: str, reference: str, settings: EvalConfig | None = 
         raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
     usable_device(settings.device)
     first = open_source(samples, settings.data.bad_points, settings.samples_format)
-    second = open_source(reference, settings.data.bad_points)
+    second = open_reference(reference, settings)
     if isinstance(first, RunSource):
         raise ConfigError(
             f"the run {samples}, which holds no scans",
@@ -197,18 +198,58 @@ def compare_sources(samples: str, reference: str, settings: EvalConfig | None = 
     return card, pair
 
 
-def open_pair(samples: Source, reference: Source, settings: EvalConfig) -> EvalPair:
+def open_reference(text: str, settings: EvalConfig) -> Source | ReferenceFile:
+    """Open a reference: a source of scans, or the file of what metrics keep of one."""
+    return reference_file(text) or open_source(text, settings.data.bad_points)
+
+
+def open_pair(samples: Source, reference: Source | ReferenceFile, settings: EvalConfig) -> EvalPair:
     """Read the two sets of an evaluation, and warn where they are not comparable."""
     protocol, config = load_protocol(settings.protocol), settings.data_config()
-    sensor = load_sensor(settings.sensor) if settings.sensor else protocol.load_sensor()
-    if sensor is None and (settings.data.columns or settings.data.projection != "sensor"):
-        sensor = samples.sensor  # named for prepared scans and .npy, which else keep their own columns and projection
-    sensor = sensor and config.imaged(sensor)
-    pair = pair_for_protocol(samples, reference, protocol, config, sensor)
+    if isinstance(reference, ReferenceFile):
+        named = public_name(settings.protocol)
+        reference.require(named, protocol.sha256, settings.resampling, settings.seed, settings.pixel_statistics)
+        pair, told = reference.pair_with(samples, protocol, config), samples.doubts
+    else:
+        pair = pair_for_protocol(samples, reference, protocol, config, _sensor(samples, settings))
+        told = (*samples.doubts, *reference.doubts)
     for warning in filter(None, (*pair.warnings, pair.leak)):
-        if warning not in (*samples.doubts, *reference.doubts):  # which were told when the scans were opened
+        if warning not in told:  # when the scans were opened
             reporting.message(f"WARNING: {warning}")
     return pair
+
+
+def _sensor(scans: Source, settings: EvalConfig) -> SensorModel | None:
+    """Return the sensor of the images that the user or the protocol names; None for the scans' own."""
+    config = settings.data_config()
+    sensor = load_sensor(settings.sensor) if settings.sensor else load_protocol(settings.protocol).load_sensor()
+    if sensor is None and (settings.data.columns or settings.data.projection != "sensor"):
+        sensor = scans.sensor  # named for prepared scans and .npy, which else keep their own columns and projection
+    return sensor and config.imaged(sensor)
+
+
+def save_reference(scans: str, path: Path, settings: EvalConfig) -> ReferenceFile:
+    """Write all that metrics keep of real scans into a file, by which others score samples without these scans.
+
+    The file holds no scan. Metrics that the user named are kept at any size, those of the protocol up to a limit.
+
+    Raises:
+        LidarGritError: not one metric could be fed; the reason of the first.
+    """
+    usable_device(settings.device)
+    protocol, config = load_protocol(settings.protocol), settings.data_config()
+    source = open_source(scans, settings.data.bad_points)
+    opened = Opened.of(source, _sensor(source, settings), config)
+    count = min(len(opened.images), config.max_scans or len(opened.images))
+    real = opened.as_set(count, protocol.range_m)
+    factories = [metric_factory(choice, settings) for choice in settings.chosen_metrics()]
+    kept = keep_real(factories, real, settings.resampling, settings.pixel_statistics)
+    errors = [each for each in kept if isinstance(each, LidarGritError)]
+    if len(errors) == len(kept):
+        raise errors[0]
+    by = public_name(settings.protocol), protocol.sha256
+    both = [*zip(factories, kept, strict=True)]
+    return write_reference(path, by, opened, real, both, settings.resampling, keep_all=bool(settings.metrics))
 
 
 def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
@@ -220,7 +261,9 @@ def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
     protocol = load_protocol(settings.protocol)
     wanted, not_applicable = _applicable(settings.chosen_metrics(), pair)
     factories = [metric_factory(choice, settings) for choice in wanted]
-    found = score_metrics(factories, pair, settings.resampling, settings.pixel_statistics)
+    file = pair.reference.file if isinstance(pair.reference, FiledSet) else None
+    kept = [file.kept(factory) for factory in factories] if file else []
+    found = score_metrics(factories, pair, settings.resampling, settings.pixel_statistics, kept)
     scores = [score for score in found if isinstance(score, Score)]
     errors = [error for error in found if isinstance(error, LidarGritError)]
     left_out = [

@@ -170,7 +170,7 @@ def measure_source(
     if source.has_points:
         with suppress(ScanError):  # of a first scan that was left out, and told of
             reporting.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))
-    if shared := overlap(run, None, images):
+    if shared := overlap(run, None, images.provenance):
         reporting.message(
             f"WARNING: {run.text} has learned from some of these scans ({shared}): the figures flatter it"
         )

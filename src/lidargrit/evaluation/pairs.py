@@ -130,27 +130,41 @@ def pair_for_protocol(
     """
     sensor = sensor or protocol.load_sensor()
     config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))
-    first = _Opened.of(samples, sensor, config)
+    first = Opened.of(samples, sensor, config)
     if samples.has_points:  # whose points may have had to go by elevation: then so do the reference's
         config = replace(config, projection_variant=first.projection_variant)
-    second = _Opened.of(reference, first.images.sensor, config)
+    second = Opened.of(reference, first.images.sensor, config)
     if samples.has_points and second.images.sensor.projection != first.images.sensor.projection:
         config = replace(config, projection_variant=second.projection_variant)
-        first = _Opened.of(samples, second.images.sensor, config)
-    require_same_rays(first.images.sensor, second.images.sensor)
+        first = Opened.of(samples, second.images.sensor, config)
     count = min(len(first.images), len(second.images), config.max_scans or len(first.images))
-    pair = EvalPair(first.as_set(count, protocol.range_m), second.as_set(count, protocol.range_m))
-    warnings = (*_warnings(pair), *first.doubts, *second.doubts)
-    shared = overlap(samples, first.images, second.images)
+    return paired(first, second.as_set(count, protocol.range_m), protocol, second.images.provenance, second.doubts)
+
+
+def paired(
+    first: "Opened", reference: EvalSet, protocol: Protocol, provenance: Provenance, doubts: tuple[str, ...]
+) -> EvalPair:
+    """Return the pair of opened samples and a reference, with all that is to be told of the two.
+
+    Args:
+        first: samples, at least as many as the reference has scans.
+        provenance: provenance of the reference.
+        doubts: reasons to doubt the reference.
+    """
+    samples = first.source
+    require_same_rays(first.images.sensor, reference.images.sensor)
+    pair = EvalPair(first.as_set(len(reference), protocol.range_m), reference)
+    warnings = (*_warnings(pair), *first.doubts, *doubts)
+    shared = overlap(samples, first.images, provenance)
     leak = f"{samples.text} and the reference overlap ({shared}): the scores flatter it" if shared else ""
     if reference.data_set == "samples" != samples.data_set:
-        swapped = f"{reference.text} was generated, and {samples.text} was not: the order is SAMPLES REFERENCE"
+        swapped = f"{reference.source} was generated, and {samples.text} was not: the order is SAMPLES REFERENCE"
         warnings = (*warnings, swapped)
     return replace(pair, deviations=deviations(pair, protocol), warnings=warnings, leak=leak)
 
 
 @dataclass(frozen=True, eq=False)
-class _Opened:
+class Opened:
     """Images of a source, and what the source says of them; later it speaks of those that were opened last."""
 
     source: Source
@@ -159,7 +173,8 @@ class _Opened:
     doubts: tuple[str, ...]
 
     @classmethod
-    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig) -> "_Opened":
+    def of(cls, source: Source, sensor: SensorModel | None, config: DataConfig) -> "Opened":
+        """Open the images of a source: see :meth:`.Source.images`."""
         images = source.images(sensor, config)
         return cls(source, images, source.projection_variant, source.doubts)
 

@@ -39,6 +39,7 @@ class EvalSetRecord:
         sha256: hash of the pixels that were compared.
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
         streets: versions of the simulated streets that the scans are of, or that their model learned from.
+        file_sha256: hash of the reference file that stood in for the scans; "" where these were here.
     """
 
     source: str
@@ -51,6 +52,7 @@ class EvalSetRecord:
     sha256: str
     weights_sha256: str = field(default="", compare=False)  # equal pixels are equal
     streets: tuple[str, ...] = field(default=(), compare=False)
+    file_sha256: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True)

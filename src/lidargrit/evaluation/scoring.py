@@ -1,11 +1,12 @@
 """Two sets and a list of metrics → scores with intervals and reference rows; shared features are computed once."""
 
 import time
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import torch
 
@@ -18,6 +19,7 @@ from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import MetricChoice
 from lidargrit.scans.types import RangeImage
 
+Found = TypeVar("Found")
 _BATCH = 16
 _PIXELS_AT_ONCE = 1 << 24  # shuffled in memory: 1,024 scans of 64x256
 
@@ -41,31 +43,34 @@ class MetricFactory:
 
 
 @dataclass(eq=False)
-class _FedMetric:
-    """One metric, fed group by group.
+class KeptOfReal:
+    """What one metric keeps of the real scans: all that a score needs of them.
 
     Args:
-        generated: metrics that were fed one group of generated scans each.
         real: metrics that were fed one group of real scans each.
-        real_as_generated: metrics that were fed the same real scans as generated ones, for real against real.
+        as_generated: metrics that were fed the same scans as generated ones, for real against real.
         pixel_statistics: metrics that were fed pixel statistics as generated scans: of every second group of real scans
             from the first, and of the others. Empty if these are not wanted.
     """
 
-    factory: MetricFactory
-    generated: list[Part] = field(default_factory=list)
     real: list[Part] = field(default_factory=list)
-    real_as_generated: list[Part] = field(default_factory=list)
+    as_generated: list[Part] = field(default_factory=list)
     pixel_statistics: list[Part] = field(default_factory=list)
 
-    def score(self, group_sizes: Sequence[int], resampling: Resampling, begun_s: float) -> Score:
-        """Compute the value with its interval, real against real and, where they were fed, pixel statistics."""
-        metric = merged(self.generated, self.real)
+    def score(
+        self, generated: Sequence[Part], group_sizes: Sequence[int], resampling: Resampling, begun_s: float
+    ) -> Score:
+        """Compute the value with its interval, real against real and, where they were fed, pixel statistics.
+
+        Args:
+            generated: metrics that were fed one group of generated scans each.
+        """
+        metric = merged(generated, self.real)
         result = metric.compute()
         interval = reference_row = None
         if resampling.halves:
-            interval = interval_of(result.value, metric, self.generated, self.real, resampling)
-            reference_row = real_against_real(metric, self.real, self.real_as_generated, group_sizes, resampling)
+            interval = interval_of(result.value, metric, generated, self.real, resampling)
+            reference_row = real_against_real(metric, self.real, self.as_generated, group_sizes, resampling)
         seconds = time.perf_counter() - begun_s
         return Score(result, interval, reference_row, seconds, self._score_of_pixel_statistics(metric))
 
@@ -81,7 +86,11 @@ class _FedMetric:
 
 
 def score_metrics(
-    factories: Sequence[MetricFactory], pair: EvalPair, resampling: Resampling, with_pixel_statistics: bool = False
+    factories: Sequence[MetricFactory],
+    pair: EvalPair,
+    resampling: Resampling,
+    with_pixel_statistics: bool = False,
+    kept: Sequence[KeptOfReal | LidarGritError] = (),
 ) -> list[Score | LidarGritError]:
     """Score two sets by several metrics.
 
@@ -90,69 +99,135 @@ def score_metrics(
 
     Args:
         with_pixel_statistics: whether each score gets that of pixel statistics, if there are four scans or more.
+        kept: state of each metric after the real scans, or an error, where these are not here themselves; else empty.
 
     Returns:
         the score of each metric, or why it could not be computed: no weights, no reflectance, too few scans.
     """
-    found: dict[int, Score | LidarGritError] = {}
+
+    def scored(indices: list[int], advance: Callable[[int], None]) -> list[Score | LidarGritError]:
+        begun_s = time.perf_counter()
+        some = [factories[index] for index in indices]
+        generated = _fed(some, pair.samples, False, resampling, advance)
+        of_real = [each for index in indices if isinstance(each := kept[index], KeptOfReal)] if kept else []
+        of_real = of_real or _keep_real(some, pair.reference, resampling, with_pixel_statistics, advance)
+        feeding_s = (time.perf_counter() - begun_s) / len(some)
+        sizes = [len(group) for group in _groups(pair.samples, resampling)]
+        found: list[Score | LidarGritError] = []
+        for each, parts in zip(of_real, generated, strict=True):
+            try:
+                found.append(each.score(parts, sizes, resampling, time.perf_counter() - feeding_s))
+            except LidarGritError as error:
+                found.append(error)
+        return found
+
+    errors = {index: each for index, each in enumerate(kept) if isinstance(each, LidarGritError)}
+    sets = 1 if kept else 3 if with_pixel_statistics else 2
+    return _together(factories, pair.samples, sets, scored, errors)
+
+
+def keep_real(
+    factories: Sequence[MetricFactory], reference: EvalSet, resampling: Resampling, with_pixel_statistics: bool = False
+) -> list[KeptOfReal | LidarGritError]:
+    """Return what metrics keep of the real scans, or why one cannot: see :func:`score_metrics`."""
+
+    def kept(indices: list[int], advance: Callable[[int], None]) -> list[KeptOfReal | LidarGritError]:
+        some = [factories[index] for index in indices]
+        return [*_keep_real(some, reference, resampling, with_pixel_statistics, advance)]
+
+    return _together(factories, reference, 2 if with_pixel_statistics else 1, kept)
+
+
+def _together(
+    factories: Sequence[MetricFactory],
+    images: EvalSet,
+    sets: int,
+    found_by: Callable[[list[int], Callable[[int], None]], list[Found | LidarGritError]],
+    errors: Mapping[int, LidarGritError] = MappingProxyType({}),
+) -> list[Found | LidarGritError]:
+    """Return what is found by each metric, where those that share features are asked together.
+
+    Args:
+        sets: number of sets that are fed, for the progress.
+        found_by: function of the numbers of metrics that share features, and of what tells the progress.
+        errors: errors of metrics that are not asked, by their numbers.
+    """
+    found: dict[int, Found | LidarGritError] = {**errors}
     together: dict[Hashable, list[int]] = {}
     for index, factory in enumerate(factories):
         try:
-            extractor = factory().extractor(pair.samples.images.sensor)
+            extractor = factory().extractor(images.images.sensor) if index not in errors else None
         except LidarGritError as error:
             found[index] = error
         else:
-            together.setdefault(index if isinstance(extractor, WholeImages) else extractor, []).append(index)
-    sets = 3 if with_pixel_statistics else 2
-    with reporting.progress("scoring", sets * len(pair.samples) * len(factories)) as progress:
+            if extractor is not None:
+                together.setdefault(index if isinstance(extractor, WholeImages) else extractor, []).append(index)
+    with reporting.progress("scoring", sets * len(images) * len(factories)) as progress:
         for indices in together.values():
-            fed = {index: _FedMetric(factories[index]) for index in indices}
             note = ", ".join(factories[index].choice.metric for index in indices)
-            begun_s = time.perf_counter()
             try:
-                advance = partial(progress.advance, note=note)
-                sizes = _feed(list(fed.values()), pair, resampling, advance)
-                if with_pixel_statistics:
-                    _feed_pixel_statistics(list(fed.values()), pair.reference, resampling, advance)
+                found |= zip(indices, found_by(indices, partial(progress.advance, note=note)), strict=True)
             except ScanError:
                 raise
             except LidarGritError as error:
                 found |= dict.fromkeys(indices, error)
-                continue
-            feeding_s = (time.perf_counter() - begun_s) / len(indices)
-            for index, metric in fed.items():
-                try:
-                    found[index] = metric.score(sizes, resampling, time.perf_counter() - feeding_s)
-                except LidarGritError as error:
-                    found[index] = error
     return [found[index] for index in range(len(factories))]
 
 
-def _feed(
-    fed: Sequence[_FedMetric], pair: EvalPair, resampling: Resampling, advance: Callable[[int], None]
-) -> list[int]:
-    """Feed both sets to metrics that share features, and return the number of scans in each group."""
-    groups = blocks(len(pair.samples), resampling.groups if resampling.halves else 1)
-    for real, images in ((False, pair.samples), (True, pair.reference)):
-        for group in groups:
-            parts = [each.factory() for each in fed]
-            as_generated = [each.factory() for each in fed] if real and resampling.halves else []
-            for metric in (*parts, *as_generated):
-                metric.first_image = group.start
-            metrics = [(metric, real) for metric in parts] + [(metric, False) for metric in as_generated]
-            for first in range(0, len(group), _BATCH):
-                batch = images.batch(group[first : first + _BATCH])
-                update_together(metrics, batch)
-                advance(len(fed) * len(batch))
-            for each, metric in zip(fed, parts, strict=True):
-                (each.real if real else each.generated).append(Part(metric))
-            for each, metric in zip(fed, as_generated, strict=False):
-                each.real_as_generated.append(Part(metric))
-    return [len(group) for group in groups]
+def _groups(images: EvalSet, resampling: Resampling) -> list[range]:
+    return blocks(len(images), resampling.groups if resampling.halves else 1)
+
+
+def _fed(
+    factories: Sequence[MetricFactory],
+    images: EvalSet,
+    real: bool,
+    resampling: Resampling,
+    advance: Callable[[int], None],
+) -> list[list[Part]]:
+    """Feed a set to metrics that share features, group by group.
+
+    Returns:
+        the parts of each metric, and behind those of real scans, where there are intervals, the parts of each metric
+        that were fed these as generated ones.
+    """
+    sides = [real, False] if real and resampling.halves else [real]
+    found: list[list[Part]] = [[] for _ in range(len(sides) * len(factories))]
+    for group in _groups(images, resampling):
+        metrics = [(factory(), side) for side in sides for factory in factories]
+        for metric, _ in metrics:
+            metric.first_image = group.start
+        for first in range(0, len(group), _BATCH):
+            batch = images.batch(group[first : first + _BATCH])
+            update_together(metrics, batch)
+            advance(len(factories) * len(batch))
+        for parts, (metric, _) in zip(found, metrics, strict=True):
+            parts.append(Part(metric))
+    return found
+
+
+def _keep_real(
+    factories: Sequence[MetricFactory],
+    reference: EvalSet,
+    resampling: Resampling,
+    with_pixel_statistics: bool,
+    advance: Callable[[int], None],
+) -> list[KeptOfReal]:
+    count = len(factories)
+    parts = _fed(factories, reference, True, resampling, advance)
+    as_generated = parts[count:] or [[] for _ in factories]
+    found = [KeptOfReal(*each) for each in zip(parts[:count], as_generated, strict=True)]
+    if with_pixel_statistics:
+        _feed_pixel_statistics(factories, found, reference, resampling, advance)
+    return found
 
 
 def _feed_pixel_statistics(
-    fed: Sequence[_FedMetric], reference: EvalSet, resampling: Resampling, advance: Callable[[int], None]
+    factories: Sequence[MetricFactory],
+    kept: Sequence[KeptOfReal],
+    reference: EvalSet,
+    resampling: Resampling,
+    advance: Callable[[int], None],
 ) -> None:
     """Feed pixel statistics of every second group, then of the others, to metrics that share features."""
     groups = blocks(len(reference), resampling.groups)
@@ -160,13 +235,13 @@ def _feed_pixel_statistics(
         indices = [index for group in groups[half::2] for index in group]
         if len(groups) < 2 or len(indices) < 2:  # one scan has nothing to be shuffled with
             return
-        metrics = [each.factory() for each in fed]
+        metrics = [factory() for factory in factories]
         for images in pixel_statistics(reference, indices, scan_seed(resampling.seed, 3, half)):
             for first in range(0, len(images), _BATCH):
                 batch = images[first : first + _BATCH]
                 update_together([(metric, False) for metric in metrics], batch)
-                advance(len(fed) * len(batch))
-        for each, metric in zip(fed, metrics, strict=True):
+                advance(len(metrics) * len(batch))
+        for each, metric in zip(kept, metrics, strict=True):
             each.pixel_statistics.append(Part(metric))
 
 

@@ -31,7 +31,7 @@ from lidargrit.scans.fills import fill_from_nearest
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, TokenGrid
 
-_DECODED_AT_ONCE = 4  # scans; enough to keep a GPU busy, and more would only take memory: 35 MB a layer at 64x1024
+_DECODED_AT_ONCE = 4  # scans on a CPU, where more would only take memory: 35 MB a layer at 64x1024
 
 
 PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
@@ -172,7 +172,8 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
     ) -> RangeImage:
         """Decode sampled tokens to scans: those that are wanted, and the rest of the last one's batch.
 
-        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size.
+        Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size; on a GPU
+        all of them at once.
 
         Args:
             tokens: tokens of ``compute_batch`` scans in raster order.
@@ -182,9 +183,10 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             condition: observed part of the scans, which a pixel decoder keeps.
         """
         images = []
-        for first in range(0, wanted, _DECODED_AT_ONCE):
-            some = slice(first, first + _DECODED_AT_ONCE)
-            grid = TokenGrid(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
+        at_once = _DECODED_AT_ONCE if tokens.device.type == "cpu" else len(tokens)
+        for first in range(0, wanted, at_once):
+            some = slice(first, first + at_once)
+            grid = TokenGrid.unchecked(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
             if self.pixels is not None and mask in ("auto", "pixels"):
                 part = None if condition is None else condition[some]
                 images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
@@ -289,7 +291,7 @@ class PixelObjective(Objective):
         if self._tokens is not None and self._decoding is not None:
             tokenizer = self._decoding.network(images.range_m.device)
             with torch.no_grad(), without_autocast(images.range_m.device):  # as when scans are sampled
-                decoded = tokenizer.decode(TokenGrid(self._tokens(images).long(), tokenizer.num_codes))
+                decoded = tokenizer.decode(TokenGrid.unchecked(self._tokens(images).long(), tokenizer.num_codes))
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
         else:

@@ -1,7 +1,8 @@
 """What is known of scans that are to be generated: nothing, or range images and masks → :class:`Observed`."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from copy import copy
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, Self
 
 import torch
@@ -69,13 +70,13 @@ class Condition:
         return cls(**given)
 
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
-        changed: dict[str, Any] = {}
+        made = copy(self)  # the scans were checked already, and a check would wait for their device
         for name, value in ((each.name, getattr(self, each.name)) for each in fields(self)):
             if isinstance(value, Mapping):
-                changed[name] = {key: change(known) for key, known in value.items()}
+                vars(made)[name] = {key: change(known) for key, known in value.items()}
             elif isinstance(value, Tensor):
-                changed[name] = change(value)
-        return replace(self, **changed)
+                vars(made)[name] = change(value)
+        return made
 
     def put_into(self, generated: RangeImage) -> RangeImage:
         """Return generated scans in which all that is known pixel by pixel stands as it is known."""
@@ -129,14 +130,14 @@ class Observed(Condition):
         if self.range_m.shape != size:
             raise ConfigError(f"range_m of {tuple(self.range_m.shape)}", f"{size}, of the sensor", "give all one shape")
         object.__setattr__(self, "planes", checked_planes(self.planes, self.range_m.shape))
-        range_m = self.range_m[self.range_observed]
-        if not bool(((range_m > 0) & range_m.isfinite()).all()):
+        if not bool((((self.range_m > 0) & self.range_m.isfinite()) | ~self.range_observed).all()):
             raise ScanError("an observed range of 0 metres, NaN or infinity", "positive metres", "mark it as unknown")
         if bool((self.return_observed & self.return_mask & ~self.range_observed).any()):
             raise ScanError("an observed return of unknown range", "both, or neither", "mark it as unknown")
         if self.reflectance is not None:
-            reflectance = self.reflectance[self.return_observed & self.return_mask]
-            if not bool(((reflectance >= 0) & (reflectance <= 1)).all()):  # NaN is neither
+            returned = self.return_observed & self.return_mask
+            within = (self.reflectance >= 0) & (self.reflectance <= 1)  # NaN is neither
+            if not bool((within | ~returned).all()):
                 got = "an observed return whose reflectance is NaN, below 0 or above 1"
                 raise ScanError(got, "values in [0, 1]", "scale it, e.g. divide an intensity of 0..255 by 255")
 
@@ -168,10 +169,11 @@ class Observed(Condition):
         return cls(clean.range_m, hit, torch.zeros_like(hit), ~clean.return_mask & ~unknown, clean.sensor, planes)
 
     @classmethod
-    def nothing(cls, sensor: SensorModel, count: int) -> "Observed":
+    def nothing(cls, sensor: SensorModel, count: int, device: torch.device | str = "cpu") -> "Observed":
         """Return the condition of a number of scans of which nothing was observed."""
-        none = torch.zeros(count, sensor.height, sensor.width, dtype=torch.bool)
-        return cls(none.float(), none, none, none, sensor)
+        none = torch.zeros(1, sensor.height, sensor.width, dtype=torch.bool)
+        one = cls(none.float(), none, none, none, sensor)
+        return one._mapped(lambda unknown: torch.zeros((count, *unknown.shape[1:]), dtype=unknown.dtype, device=device))
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:

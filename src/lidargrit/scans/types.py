@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -190,6 +191,16 @@ class RangeImage:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "range_m", self.range_m.float())  # those of NumPy often have 64 bits
+        self._check_shapes()
+        if not self._is_valid():
+            valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
+            raise ScanError(
+                f"{int((~valid).sum())} pixels whose range contradicts their return mask",
+                "a positive finite range on every return and 0 elsewhere",
+                "build the image with RangeImage.masked",
+            )
+
+    def _check_shapes(self) -> None:
         size = tuple(self.range_m.shape[-2:])
         if size != (self.sensor.height, self.sensor.width):
             raise ConfigError(
@@ -201,20 +212,13 @@ class RangeImage:
             wanted = f"the {tuple(self.range_m.shape)} of range_m"
             raise ConfigError(f"return_mask of {tuple(self.return_mask.shape)}", wanted, "give all one shape")
         object.__setattr__(self, "planes", checked_planes(self.planes, self.range_m.shape))
-        if not self._is_valid():
-            valid = torch.where(self.return_mask, (self.range_m > 0) & self.range_m.isfinite(), self.range_m == 0)
-            raise ScanError(
-                f"{int((~valid).sum())} pixels whose range contradicts their return mask",
-                "a positive finite range on every return and 0 elsewhere",
-                "build the image with RangeImage.masked",
-            )
 
     def _is_valid(self) -> bool:
         if not self.range_m.numel() or self.range_m.is_meta:  # without values, where operations are only counted
             return True
         nearest, farthest = self.range_m.aminmax()  # NaN where any is: no comparison holds
-        positive = self.range_m > 0
-        return bool(nearest >= 0) and bool(farthest < torch.inf) and torch.equal(positive, self.return_mask)
+        agrees = ((self.range_m > 0) == self.return_mask).all()
+        return bool((nearest >= 0) & (farthest < torch.inf) & agrees)  # the host waits once for a GPU
 
     @classmethod
     def masked(
@@ -239,12 +243,10 @@ class RangeImage:
 
     @classmethod
     def _joined(cls, images: "Sequence[RangeImage]", join: Callable[[list[Tensor]], Tensor]) -> "RangeImage":
-        return cls(
-            join([image.range_m for image in images]),
-            join([image.return_mask for image in images]),
-            sensor_of_all([image.sensor for image in images]),
-            common_planes([image.planes for image in images], join),
-        )
+        sensor_of_all([image.sensor for image in images])
+        planes = common_planes([image.planes for image in images], join)
+        range_m, mask = join([image.range_m for image in images]), join([image.return_mask for image in images])
+        return images[0]._of_checked(range_m, mask, planes)
 
     @property
     def reflectance(self) -> Float[Tensor, "*batch H W"] | None:
@@ -265,11 +267,22 @@ class RangeImage:
 
     def __getitem__(self, index: int | slice | list[int]) -> "RangeImage":
         """Return one image of a batch, or a batch of some of its images."""
-        return self.mapped(lambda pixels: pixels[index])
+        return self._moved(lambda pixels: pixels[index])
 
     def to(self, device: torch.device | str) -> "RangeImage":
         """Return the image with its pixels on another device."""
-        return self.mapped(lambda pixels: pixels.to(device))
+        return self._moved(lambda pixels: pixels.to(device))
+
+    def _moved(self, move: Callable[[Tensor], Tensor]) -> "RangeImage":
+        planes = {name: move(pixels) for name, pixels in self.planes.items()}
+        return self._of_checked(move(self.range_m), move(self.return_mask), planes)
+
+    def _of_checked(self, range_m: Tensor, return_mask: Tensor, planes: Mapping[str, Tensor]) -> "RangeImage":
+        """Return an image of pixels whose values were checked when they came: another check would wait for a GPU."""
+        made = copy(self)
+        vars(made).update(range_m=range_m, return_mask=return_mask, planes=planes)
+        made._check_shapes()
+        return made
 
     def mapped(self, change: Callable[[Tensor], Tensor], sensor: SensorModel | None = None) -> "RangeImage":
         """Return the image in which range, mask and whatever else it has are changed alike.
@@ -310,12 +323,20 @@ class TokenGrid:
     def __post_init__(self) -> None:
         if self.tokens.is_meta or not self.tokens.numel():  # without values, where operations are only counted
             return
-        if not (int(self.tokens.min()) >= 0 and int(self.tokens.max()) < self.num_codes):
+        lowest, highest = self.tokens.aminmax()
+        if bool((lowest < 0) | (highest >= self.num_codes)):
             raise ConfigError(
-                f"tokens from {int(self.tokens.min())} to {int(self.tokens.max())}",
+                f"tokens from {int(lowest)} to {int(highest)}",
                 f"tokens of a codebook of {self.num_codes} codes",
                 "use the tokenizer that made them",
             )
+
+    @classmethod
+    def unchecked(cls, tokens: Int[Tensor, "*batch h w"], num_codes: int) -> "TokenGrid":
+        """Return a grid of tokens that a network of the package has just made: a check would wait for a GPU."""
+        made = object.__new__(cls)
+        vars(made).update(tokens=tokens, num_codes=num_codes)
+        return made
 
 
 @dataclass(frozen=True, eq=False)

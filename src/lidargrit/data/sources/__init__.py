@@ -283,16 +283,16 @@ def open_images(text: str, sensor: SensorModel | None = None, config: DataConfig
     return open_source(text, config.bad_points if config else "refuse").images(sensor, config)
 
 
-def overlap(source: Source, images: RangeImages | None, reference: RangeImages) -> str:
+def overlap(source: Source, images: RangeImages | None, reference: Provenance) -> str:
     """Return in a few words which scans a source, or the model behind it, shares with the reference; "" for none.
 
     Args:
         source: source of the set; of samples and runs, the training scans of the model count, too.
-        reference: set that it is compared with.
+        reference: provenance of the set that it is compared with.
     """
     own = Provenance() if images is None else images.provenance
     learned_from = source.learned_from() or Provenance()
-    return own.overlap(reference.provenance) or learned_from.overlap(reference.provenance)
+    return own.overlap(reference) or learned_from.overlap(reference)
 
 
 def data_set_of(text: str) -> tuple[str, str]:

@@ -193,6 +193,34 @@ class Metric(ABC, Generic[Features, Kept]):
         """Return what has been kept of one set."""
         return self._kept[real].value()
 
+    @final
+    def state(self, *, real: bool) -> dict[str, np.ndarray]:
+        """Return all that has been kept of one set, of at least one image, as arrays by name: see :meth:`restore`."""
+        return self._kept[real].arrays()
+
+    @final
+    def restore(
+        self, state: Mapping[str, np.ndarray], sensor: SensorModel, num_images: int, weights_sha256: str, *, real: bool
+    ) -> None:
+        """Take what :meth:`state` returned for images of a sensor, as if they had been fed here.
+
+        Args:
+            num_images: number of these images.
+            weights_sha256: hash of the weights by which it was made; "" without any.
+
+        Raises:
+            KeyError: an array is missing.
+            DataError: it was made by other weights than are here.
+        """
+        self.require_same_kind(ImageKind.of(sensor))
+        self.extractor(sensor)  # some know only now which weights these images need
+        if self.weights_sha256 != weights_sha256:
+            ours, theirs = (sha256[:8] or "none" for sha256 in (self.weights_sha256, weights_sha256))
+            got = f"weights {ours} for {self.name}, and a reference that was made by {theirs}"
+            raise DataError(got, "the same weights", f"name these by --weights {self.needs_weights}=...")
+        self._kept[real].restore(state)
+        self.num_images[real] = num_images
+
     def choose_as(self, whole: "Metric[Features, Kept]") -> None:
         """Make the choices that depend on the size of the sets, if any, as a metric of larger ones makes them.
 

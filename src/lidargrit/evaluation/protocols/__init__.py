@@ -1,6 +1,8 @@
 """The name of a protocol → the metrics that it asks for, and the images on which it computes them."""
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import UnknownNameError, one_of
@@ -57,6 +59,12 @@ class Protocol:
             return None
         sensor = load_sensor(self.sensor)
         return sensor.with_columns(self.columns, self.column_stride) if self.columns else sensor
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all that a protocol fixes, without what it says of itself."""
+        told = {"title": "", "source": "", "departures": ()}
+        return hashlib.sha256(json.dumps(asdict(replace(self, **told))).encode()).hexdigest()
 
     def scans_at_most(self, wanted: int = 0) -> int:
         """Return the largest number of scans of each set; 0 for as many as there are.

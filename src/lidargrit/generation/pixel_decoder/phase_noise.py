@@ -48,6 +48,7 @@ class PhaseNoise(nn.Module):
         """Take in the residuals of true masks.
 
         Args:
+            phases: consecutive phases.
             logits: logits of the probability of a return, given the earlier phases; infinite for pixels to leave out.
             returned: True where a pixel returned.
         """
@@ -56,10 +57,11 @@ class PhaseNoise(nn.Module):
         pairs = [(factors[..., :-1, :], factors[..., 1:, :])]
         if factors.shape[-1] > 1:  # one column alone would be its own neighbour
             pairs.append((factors, factors.roll(-1, -1)))
-        numbers = torch.tensor([self.phases.index(phase) for phase in phases], device=seen.device)
+        first = self.phases.index(phases[0])
         for direction, (one, other) in enumerate(pairs):
-            seen[numbers, direction, :-1] = (one * other).sum((2, 3, 4)).T.to(seen)
-            seen[numbers, direction, -1] = logits.shape[1]
+            some = seen[first : first + len(phases), direction]
+            some[:, :-1] = (one * other).sum((2, 3, 4)).T
+            some[:, -1] = logits.shape[1]
         seen, scans = sum_over_processes(seen).split((1 + _TERMS, 1), -1)  # which may each have taken other phases
         kept = 0.5 ** ((seen[:, :, 1:2] > 0) * (scans / _HALF_LIFE_SCANS))
         self.sums.mul_(kept).add_(seen)

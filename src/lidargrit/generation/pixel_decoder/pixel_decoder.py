@@ -226,15 +226,16 @@ class PixelDecoder(nn.Module):
         shares = self.mask.noise.shares(choices.mask_correlation)
         for numbers, rng in zip(uniform, rngs, strict=True):
             numbers[0] = self.mask.noise(numbers[0], rng, shares)
-        uniform = uniform.to(guide.v.device)
-        condition = (condition or Observed.nothing(self.sensor, len(rngs))).to(guide.v.device)
+        device = guide.v.device
+        uniform = uniform.to(device)
+        condition = condition.to(device) if condition else Observed.nothing(self.sensor, len(rngs), device)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
-        step = 1 if guide.v.device.type == "cpu" else len(uniform)
+        step = 1 if device.type == "cpu" else len(uniform)
         images = []
         for first in range(0, len(uniform), step):
             part = slice(first, first + step)
             some = guide.part(part)
-            with autocast_to(choices.precision, guide.v.device):
+            with autocast_to(choices.precision, device):
                 mask = self.mask.sample(some, uniform[part, 0], condition[part])
                 range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], choices)
             reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
@@ -256,12 +257,11 @@ class PixelDecoder(nn.Module):
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
             mixture = self.range.distributions([phase], guided, guide, mask, v)
-            unknown = mask[pixels] & ~condition.range_observed[pixels]
-            component, within = (random[unknown] for random in uniform[pixels].unbind(1))
-            sampled = mixture.at(unknown[None]).sample(component, within, temperature, sampling.range_noise)
-            found = torch.where(mask[pixels], condition.range_m[pixels], 0.0)
-            found[unknown] = sampled
-            range_m[pixels] = found
+            # Of every pixel, though some are observed and some do not return: the host need not know which.
+            component, within = uniform[pixels][None].unbind(2)
+            sampled = mixture.sample(component, within, temperature, sampling.range_noise)[0]
+            found = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
+            range_m[pixels] = found.where(mask[pixels], 0.0)
             v[pixels] = range_m[pixels].log1p()
         return range_m
 

@@ -191,7 +191,9 @@ class PhaseNetwork(nn.Module):
             width = widths[lattice.area >= _COARSE_AREA]
             network = LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
             self.networks[lattice.name] = network
+        self.register_buffer("before", generated_before(self.phases), persistent=False)
 
+    before: Tensor
     context_channels: int
     added_without_tokens = 0
 
@@ -209,6 +211,11 @@ class PhaseNetwork(nn.Module):
         lattice = phases[0].lattice
         first = [phase for phase in self.phases if phase.lattice == lattice].index(phases[0])
         return self.networks[lattice.name](guided[lattice], contexts, first)
+
+    def generated_before(self, phases: list[Phase]) -> Float[Tensor, "P 1 4 1 1"]:
+        """Return 1 for those of the 2x2 pixels that are generated before consecutive phases', and 0 for others."""
+        first = self.phases.index(phases[0])
+        return self.before[first : first + len(phases)]
 
     def flops(self) -> int:
         """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
@@ -261,7 +268,7 @@ class MaskNetwork(PhaseNetwork):
         """
         lattice = phases[0].lattice
         returned = cells_of(return_mask[:, None].to(guide.v.dtype), lattice)
-        certain = generated_before(phases, returned)
+        certain = self.generated_before(phases)
         if guide.observed is not None:
             certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), lattice))
         return torch.cat((certain * returned, certain * (1 - returned)), 2)

@@ -143,11 +143,11 @@ def one_of_phases(phases: list[Phase], rng: torch.Generator) -> list[Phase]:
     return [phases[0 if index.is_meta else int(index)]]  # all take as many operations, where they are counted
 
 
-def generated_before(phases: Sequence[Phase], like: Float[Tensor, "*shape"]) -> Float[Tensor, "P 1 4 1 1"]:
+def generated_before(phases: Sequence[Phase]) -> Float[Tensor, "P 1 4 1 1"]:
     """Return 1 for those of the 2x2 pixels, row by row, that are generated before each phase's, and 0 for others."""
     pixels = [(row, column) for row in (0, 1) for column in (0, 1)]
-    before = [[pixel in phase.lattice.order[: phase.rank] for pixel in pixels] for phase in phases]
-    return torch.tensor(before, dtype=like.dtype, device=like.device)[:, None, :, None, None]
+    before = [[float(pixel in phase.lattice.order[: phase.rank]) for pixel in pixels] for phase in phases]
+    return torch.tensor(before)[:, None, :, None, None]
 
 
 def cells_of(maps: Float[Tensor, "B C H W"], lattice: Lattice) -> Float[Tensor, "B C*4 h w"]:

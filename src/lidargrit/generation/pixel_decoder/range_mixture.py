@@ -1,6 +1,8 @@
 """A mixture of logistic distributions of a range, cut off at the sensor's limits: numbers → density, random ranges."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +21,7 @@ _NODES = tuple(
 )
 _SURFACE_V = 0.1  # half the width of a surface in v: a tenth of its range
 _LARGEST_EXPONENT = 80.0  # its exponential stays finite in 32 bits
+_PAIRS_ON_CPU, _PAIRS_ON_GPU = 1 << 17, 1 << 28  # at once: half a megabyte, in the cache, and a gigabyte
 _LEAST_MASS = 1e-6  # of a component within the limits; the logarithm stays finite
 
 
@@ -71,7 +74,7 @@ class RangeMixture:
 
     def mode(self) -> Float[Tensor, "*P"]:
         """Return the range in metres at whose component's centre the density is the highest."""
-        densest = self._log_density_at_centres(self.logits.log_softmax(-1)).argmax(-1, keepdim=True)
+        densest = self._by_pairs(_Pairs.log_density).argmax(-1, keepdim=True)
         return self.centres.gather(-1, densest)[..., 0].expm1()
 
     def entropy(self, steps: RangeSteps) -> Float[Tensor, "*P"]:
@@ -125,38 +128,77 @@ class RangeMixture:
         """
         if temperature == 1:
             return self.logits
-        log_weights = self.logits.log_softmax(-1)
-        inverse = (-self.log_scales).exp()
-        power = (1 / temperature - 1) * self._log_density_at_centres(log_weights)
-        parts = (self.centres, inverse, log_weights.exp(), power)
-        mass, total = torch.zeros_like(self.centres), torch.zeros_like(self.centres)
-        for centre, steepness, weight, of_other in zip(*(part.split(1, -1) for part in parts), strict=True):
-            z, half = (self.centres - centre).abs_().mul_(-steepness), _SURFACE_V * steepness
-            # The other's probability there. A negative z keeps its digits where it is next to nothing.
-            there = (z + half).sigmoid_().sub_((z - half).sigmoid_()).mul_(weight)
-            mass += there
-            total += there.mul_((of_other - power).clamp_(max=_LARGEST_EXPONENT).exp_())
-        least = torch.finfo(mass.dtype).tiny  # the logarithm stays finite
-        return log_weights + mass.clamp(min=least).log() - total.clamp(min=least).log()
 
-    def _log_density_at_centres(self, log_weights: Float[Tensor, "*P K"]) -> Float[Tensor, "*P K"]:
-        """Return the natural logarithm of the density of v at every component's centre."""
-        inverse = (-self.log_scales).exp()
-        heights = (log_weights - self.log_scales - self._mass().clamp(min=_LEAST_MASS).log()).exp()
-        parts = (self.centres, inverse, heights)
-        density = torch.zeros_like(self.centres)
-        # One component after the other takes less memory than all pairs at once, and half the time.
-        for centre, steepness, height in zip(*(part.split(1, -1) for part in parts), strict=True):
-            s = ((self.centres - centre) * steepness).sigmoid_()
-            density += s.addcmul_(s, s, value=-1).mul_(height)  # the logistic density is s (1 - s) / scale
-        return density.clamp(min=torch.finfo(density.dtype).tiny).log()
+        def log_correction(pairs: "_Pairs") -> Tensor:
+            power = pairs.log_density().mul_(1 / temperature - 1)
+            there = pairs.mass_near_centres()
+            mass = there.sum(0)
+            by_power = (power.T[..., None] - power).clamp_(max=_LARGEST_EXPONENT).exp_()
+            return _finite_log(mass).sub_(_finite_log(there.mul_(by_power).sum(0)))
+
+        return self.logits.log_softmax(-1) + self._by_pairs(log_correction)
+
+    @torch.no_grad()
+    def _by_pairs(self, compute: Callable[["_Pairs"], Tensor]) -> Float[Tensor, "*P K"]:
+        """Return what a function computes from all pairs of components of some pixels, for all pixels."""
+        log_weights, mass = self.logits.log_softmax(-1), self._mass().clamp(min=_LEAST_MASS)
+        heights = (log_weights - self.log_scales - mass.log()).exp()
+        parts = (self.centres, (-self.log_scales).exp(), heights, log_weights.exp())
+        count = self.centres.shape[-1]
+        at_once = max(1, (_PAIRS_ON_CPU if self.centres.device.type == "cpu" else _PAIRS_ON_GPU) // count**2)
+        blocks = zip(*(part.reshape(-1, count).split(at_once) for part in parts), strict=True)
+        return torch.cat([compute(_Pairs(*block)) for block in blocks]).view_as(self.centres)
 
     def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
         """Return each component's distribution function at the two limits."""
-        low, high = torch.tensor(self.limits_m, dtype=self.centres.dtype, device=self.centres.device).log1p()
+        low, high = _log1p(self.limits_m)
         inverse = (-self.log_scales).exp()
         return ((low - self.centres) * inverse).sigmoid(), ((high - self.centres) * inverse).sigmoid()
 
     def _mass(self) -> Float[Tensor, "*P K"]:
         low, high = self._bounds()
         return high - low
+
+
+class _Pairs:
+    """All pairs of the components of some pixels: the other one first, then the pixel, then the one looked at.
+
+    Args:
+        centres: centres of the components.
+        inverse: reciprocals of the components' scales.
+        heights: weights of the components, divided by scale and by mass within the limits.
+        weights: weights of the components.
+    """
+
+    def __init__(
+        self,
+        centres: Float[Tensor, "P K"],
+        inverse: Float[Tensor, "P K"],
+        heights: Float[Tensor, "P K"],
+        weights: Float[Tensor, "P K"],
+    ) -> None:
+        others, self._steepness, self._heights, self._weights = (
+            part.T[..., None] for part in (centres, inverse, heights, weights)
+        )
+        # The other's distance in its scales. A negative one keeps the digits of what is next to nothing.
+        self._distance = (centres - others).abs_().mul_(-self._steepness)
+
+    def log_density(self) -> Float[Tensor, "P K"]:
+        """Return the natural logarithm of the density of v at every component's centre."""
+        s = self._distance.sigmoid()
+        return _finite_log(s.addcmul_(s, s, value=-1).mul_(self._heights).sum(0))  # the logistic density: s (1 - s)
+
+    def mass_near_centres(self) -> Float[Tensor, "K P K"]:
+        """Return the probability of each other component within ``_SURFACE_V`` of a component's centre."""
+        half = _SURFACE_V * self._steepness
+        there = (self._distance + half).sigmoid_()
+        return there.sub_((self._distance - half).sigmoid_()).mul_(self._weights)
+
+
+def _finite_log(numbers: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+    return numbers.clamp_(min=torch.finfo(numbers.dtype).tiny).log_()
+
+
+@cache
+def _log1p(limits_m: tuple[float, float]) -> list[float]:
+    return torch.tensor(limits_m, device="cpu").log1p().tolist()  # a tensor would be copied to the device each time

@@ -12,7 +12,6 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,
     cells_of,
-    generated_before,
     phases_of,
     pixels_around,
 )
@@ -80,7 +79,7 @@ class RangeNetwork(PhaseNetwork):
         candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
         maps = cells_of(torch.stack((return_mask.to(v.dtype), v - guide.v), 1), phases[0].lattice)
         returned, beside = maps.chunk(2, 1)
-        generated = generated_before(phases, returned) * returned
+        generated = self.generated_before(phases) * returned
         apart = self.suggest.differences(candidates.flatten(0, 1)).unflatten(0, candidates.shape[:2])
         dropped = (1 - returned).expand_as(generated)
         parts = [generated, dropped, generated * beside, (candidates - expected).clamp(-2, 2), apart]

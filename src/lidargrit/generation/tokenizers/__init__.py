@@ -113,7 +113,7 @@ class CodebookTokenizer(Tokenizer[Config]):
     def quantised(self, latents: Float[Tensor, "B D h w"]) -> TokenGrid:
         """Return the tokens (B, h, w) of latents."""
         tokens = self.quantize.nearest(latents.movedim(1, -1).flatten(0, -2))
-        return TokenGrid(tokens.unflatten(0, (len(latents), *latents.shape[2:])), self.num_codes)
+        return TokenGrid.unchecked(tokens.unflatten(0, (len(latents), *latents.shape[2:])), self.num_codes)
 
     def warnings(self) -> list[str]:
         """Return a line with the remedy if the codebook has collapsed."""

@@ -124,7 +124,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         level = ((nearest.log() - self._low) / (self._high - self._low) * config.levels).floor()
         level = level.nan_to_num(posinf=0).clamp(0, config.levels - 1).long()
         tokens = torch.where(nearest < torch.inf, level * config.num_patterns + pattern, 0)
-        return TokenGrid(tokens, self.num_codes)
+        return TokenGrid.unchecked(tokens, self.num_codes)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return the likeliest range and the logit of a return of every pixel of a batch of tokens."""

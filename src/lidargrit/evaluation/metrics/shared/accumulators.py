@@ -1,6 +1,7 @@
 """Accumulators of a metric: summaries of batches → one summary of a set, which can be merged from parts."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -22,6 +23,18 @@ class Accumulator(ABC, Generic[Kept]):
     @abstractmethod
     def value(self) -> Kept:
         """Return everything collected so far, from at least one batch."""
+
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return everything collected, from at least one batch, as arrays by name, for a file."""
+
+    @abstractmethod
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take what :meth:`arrays` returned in place of what was collected.
+
+        Raises:
+            KeyError: an array that is missing.
+        """
 
 
 class RowAccumulator(Accumulator[np.ndarray]):
@@ -45,6 +58,14 @@ class RowAccumulator(Accumulator[np.ndarray]):
             self._parts = [np.concatenate(self._parts)]
         return self._parts[0]
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the rows."""
+        return {"rows": self.value()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take the rows."""
+        self._parts = [arrays["rows"]]
+
 
 class SumAccumulator(Accumulator[np.ndarray]):
     """Keeps the sum of all summaries, so that memory does not grow with the number of images."""
@@ -66,3 +87,11 @@ class SumAccumulator(Accumulator[np.ndarray]):
         """Return the sum."""
         assert self._total is not None
         return self._total
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the sum."""
+        return {"total": self.value()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take the sum."""
+        self._total = arrays["total"]

@@ -1,6 +1,7 @@
 """Two sets of features → Fréchet distance of the normal distributions with their means and covariances."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,10 +44,21 @@ class Moments(Accumulator["Moments"]):
         """Return the moments themselves."""
         return self
 
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return number, mean and R."""
+        return {"num": np.array(self.num), "mean": self.mean, "rows": self._all_rows()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take number, mean and R."""
+        self.num, self.mean, self._rows = int(arrays["num"]), arrays["mean"], [arrays["rows"]]
+
     def root(self) -> Float64[np.ndarray, "r d"]:
         """Return a matrix whose product with itself, transposed first, is the unbiased covariance; at most d rows."""
-        rows = np.concatenate([np.zeros((0, len(self.mean))), *self._rows])
+        rows = self._all_rows()
         return (rows if len(rows) <= rows.shape[1] else _shortened(rows)) / math.sqrt(self.num - 1)
+
+    def _all_rows(self) -> Float64[np.ndarray, "r d"]:
+        return np.concatenate([np.zeros((0, len(self.mean))), *self._rows])
 
     def _join(self, num: int, mean: Float64[np.ndarray, " d"], rows: list[Float64[np.ndarray, "_ d"]]) -> None:
         if self.num == 0:

@@ -1,0 +1,123 @@
+"""What a GPU would be asked for, counted without one: kernels, waits of the host, and copies to the device."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from lidargrit.generation.batches import BatchSeeds
+from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.scans.condition import NOTHING
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling, sample_token
+from pretended_gpu import DEVICE, Counts, counted
+
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
+TOKEN_STEPS = ("nn/decoding.py", "nn/random.py")
+
+
+def test_kernels_reads_and_uploads_are_told_apart() -> None:
+    with counted() as counts:
+        numbers = torch.tensor([1.0, -2.0, 3.0]).to(DEVICE)
+        (numbers[None] * 2).sum()
+    assert totals(counts) == (2, 0, 1), "a view is no kernel"
+    with counted() as counts:
+        positive = numbers[numbers > 0]
+        assert positive.tolist() == [1.0, 3.0]
+        assert bool(numbers[0] > 0)
+        assert float(numbers.where(numbers > 0, torch.zeros((), device=DEVICE)).sum()) == 4.0
+    assert counts.reads.total() == 4, "the size of a choice, a list, a truth value, and a number"
+    with counted() as counts:
+        numbers[[0, 2]] = torch.tensor([5.0, 6.0], device=DEVICE)
+        assert numbers.tolist() == [5.0, -2.0, 6.0]
+    assert (counts.uploads.total(), counts.reads.total()) == (2, 1)
+    with counted(), pytest.raises(RuntimeError, match="tensors on two devices"):
+        numbers.add(torch.ones(3))
+
+
+def test_gradients_are_those_of_the_cpu() -> None:
+    torch.manual_seed(0)
+    layer, x = torch.nn.Conv2d(2, 3, 3), torch.randn(1, 2, 8, 8)
+    layer(x).square().sum().backward()
+    wanted = [weight.grad for weight in layer.parameters()]
+    layer.zero_grad()
+    with counted() as counts:
+        on_gpu = layer.to(DEVICE)
+        on_gpu(x.to(DEVICE)).square().sum().backward()
+        found = [weight.grad.cpu() for weight in on_gpu.parameters() if weight.grad is not None]
+    assert counts.kernels.total() > 4
+    for one, other in zip(found, wanted, strict=True):
+        assert other is not None
+        assert torch.equal(one, other)
+
+
+def totals(counts: Counts) -> tuple[int, int, int]:
+    return counts.kernels.total(), counts.reads.total(), counts.uploads.total()
+
+
+@pytest.fixture(scope="module")
+def small() -> LidarGrit:
+    """Return the networks of ``pretrained`` with few channels: as many phases and components, and 16 tokens."""
+    config = LidarGritConfig(
+        VqvaeConfig(channels=32, channel_multipliers=(1, 1, 1, 1, 1), code_dim=8, num_codes=32),
+        TransformerConfig(layers=2, heads=2, width=16),
+        PixelDecoderConfig(
+            64, mask_width=4, range_width=4, coarse_range_width=8, surface_components=True, gravity_components=True
+        ),
+        guidance=1.15,
+    )
+    torch.manual_seed(0)
+    generator = LidarGrit(config, SENSOR).eval()
+    for weight in generator.pixels.parameters() if generator.pixels is not None else ():
+        weight.data = 0.06 * torch.randn_like(weight)
+    return generator
+
+
+def sampled(generator: LidarGrit, count: int) -> tuple[RangeImage, Counts]:
+    """Sample a batch of so many scans with networks that are laid out for it, and count."""
+    seeds, sampling = BatchSeeds(range(count), count), TokenSampling(range_temperature=1.0)
+    with torch.no_grad(), counted():
+        generator.to(DEVICE)
+        generator._prepare(count, sampling)
+    with torch.no_grad(), counted() as counts:
+        scans = generator._sample(seeds, NOTHING, sampling)
+    with counted():
+        return scans.to("cpu"), counts
+
+
+def test_a_batch_of_any_size_takes_as_many_kernels_and_at_most_four_reads(small: LidarGrit) -> None:
+    # Random networks have many components at one range, between which a temperature would choose by rounding.
+    wanted = small.sample(range(8), sampling=TokenSampling(range_temperature=1.0))
+    (one, of_one), (eight, of_eight) = sampled(small, 1), sampled(small, 8)
+    behind_tokens = []
+    for counts in (of_one, of_eight):
+        tokens = sum(n for line, n in counts.kernels.items() if line.startswith(TOKEN_STEPS))
+        assert tokens <= 16 * 82, "a step of two layers, and of the weaker one"
+        behind_tokens.append(counts.kernels.total() - tokens)
+        assert behind_tokens[-1] < 5000, str(counts)
+        assert counts.reads.total() <= 3, str(counts)
+        assert counts.uploads.total() <= 2, f"random numbers of tokens and of pixels:\n{counts}"
+    assert behind_tokens[1] == pytest.approx(behind_tokens[0], rel=0.01)
+    for found in (one, eight):
+        part = wanted[: len(found)]
+        both = found.return_mask & part.return_mask
+        assert float((found.return_mask != part.return_mask).float().mean()) < 1e-3
+        assert float(((found.range_m - part.range_m).abs()[both] > 0.01).float().mean()) < 1e-3
+
+
+def test_no_recorded_step_of_tokens_waits_for_the_device(small: LidarGrit) -> None:
+    with torch.no_grad(), counted():
+        transformer = small.transformer.to(DEVICE)
+        by_choices = partial(sample_token, sampling=TokenSampling())
+        decoder = CachedDecoder(transformer, 2, by_choices, static=True, guidance=1.15)
+        uniform = torch.rand(2, transformer.context_length).to(DEVICE)
+        plain = CachedDecoder(transformer, 2, by_choices, static=False, guidance=1.15).generate(uniform)
+    with counted() as counts:
+        tokens = decoder.generate(uniform)
+    assert (counts.reads.total(), counts.uploads.total()) == (0, 0), str(counts)
+    with counted():
+        assert tokens.tolist() == plain.tolist()
