@@ -35,6 +35,7 @@ from lidargrit.simulator.tracing import Hits, Tracer, in_reach
 _GEOMETRY = ("range_histogram_per_ring", "bev_occupancy", "wall_straightness", "point_cloud_jsd")
 FITTED = [name for name in CURVES if name not in _GEOMETRY]
 # First step: the factor by which a parameter, or one of a material, is multiplied or divided, or what is added to it.
+# Paint is left out: cars are a small share of all points, and a fit of it made dark bodies return at grazing incidence.
 FACTORS = {
     "near_m": 1.5,
     "patch_spread": 1.6,
@@ -42,16 +43,13 @@ FACTORS = {
     "object_spread": 1.8,
     "pulse_spread": 2.0,
     **{f"{name}.diffuse": 1.4 for name in ("asphalt", "concrete", "plaster", "brick", "leaves", "grass")},
-    "paint.diffuse": 2.0,
-    "paint.gloss": 2.0,
-    "paint.lobe_power": 1.6,
     "foil.retroreflection": 2.0,
     "glass.diffuse": 3.0,
     "glass_passes": 1.8,
 }
 ADDENDS = {"dim_level": 0.5, "bright_level": 0.7, "dim_share": 0.1}
 FIRST_SEED, VAL_SEED = 20_000, 10_000
-GAINS = np.arange(-2.4, 1.61, 0.1)
+GAINS = np.arange(-2.4, 0.81, 0.1)  # with more, roads return from farther away than in KITTI, for want of buildings
 READINGS = np.arange(0.6, 1.41, 0.05)
 RATE_WEIGHT = 4.0  # of a row's divergence of returns over that of reflectance, which is some twenty times as large
 PULL = 3e-4  # towards 0, a unit of log gain or a third of one of log reading: as much as a rate of returns off by 0.01

@@ -22,7 +22,7 @@ class RaydropModel:
     What differs from unit to unit is in :class:`.SensorSetup`.
 
     Powers are in units of what a white plate at 1 m would send back, were the receiver in focus there. "Fitted" numbers
-    bring simulated scans nearest to 46 scans of KITTI, all together: ``benchmarks/fit_raydrop.py`` finds them, and
+    bring simulated scans nearest to 67 scans of KITTI, all together: ``benchmarks/fit_raydrop.py`` finds them, and
     ``docs/results/simulator-against-kitti.md`` says how near that is. Single ones of them are not measurements.
 
     Args:
@@ -56,12 +56,12 @@ class RaydropModel:
     gloss: float = 1.0
     retroreflection: float = 1.0
     patch_spread: float = 0.141
-    patch_deg: float = 8.68
-    object_spread: float = 0.94
-    pulse_spread: float = 0.6
+    patch_deg: float = 4.82
+    object_spread: float = 0.522
+    pulse_spread: float = 0.424
     edge_share: float = 0.05
     dim_level: float = 2.67
-    dim_share: float = 0.225
+    dim_share: float = 0.175
     bright_level: float = 3.1
     reflectance_spread: float = 0.08
     wet_darkening: float = 0.5
