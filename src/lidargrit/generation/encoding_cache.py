@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor, nn
 
-from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.precision import in_full
 from lidargrit.scans.types import RangeImage
 
 _BYTES_AT_MOST = 1 << 30  # 65,000 latents of LiDM's small preset, or a million times 256 tokens
@@ -77,7 +77,7 @@ class EncodingCache(Frozen[NetworkT]):
 
     def _encoded(self, images: RangeImage) -> Tensor:
         device = images.range_m.device
-        with without_autocast(device):
+        with in_full(device):
             return self._encode(self.network(device), images)
 
 

@@ -21,7 +21,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
-from lidargrit.nn.precision import Precision
+from lidargrit.nn.precision import Precision, inference
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing, Observed
 from lidargrit.scans.sensors import SensorModel
@@ -144,7 +144,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Fit what depends on all trained stages."""
 
     @final
-    @torch.no_grad()
+    @inference()
     def sample(
         self, seeds: Sequence[int], condition: Condition = NOTHING, sampling: SamplingT | None = None
     ) -> RangeImage:
@@ -205,7 +205,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         raise self._cannot("tokens")
 
     @final
-    @torch.no_grad()
+    @inference()
     def reconstruct(self, images: RangeImage) -> RangeImage:
         """Encode each scan and decode it again, by itself (capability ``encode``).
 
@@ -221,7 +221,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return RangeImage.cat([self._reconstruct(image) for image in one_by_one(images.to(self.device))])
 
     @final
-    @torch.no_grad()
+    @inference()
     def invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
         """Return for each scan the nearest one that the generator can generate (capability ``invert``).
 
@@ -241,7 +241,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return in_batches(seeds, self.compute_batch, lambda at, some: self._invert(images[at], some, settings))
 
     @final
-    @torch.no_grad()
+    @inference()
     def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
         """Return the negative log-likelihood of each scan in bits, each computed by itself (capability ``likelihood``).
 

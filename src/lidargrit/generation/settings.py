@@ -8,6 +8,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Positive, ShareBelow1, Weight
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import Generator, load_class
+from lidargrit.nn.precision import Precision
 from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.augmentation import Augmentation
 from lidargrit.scans.sensors import SensorModel
@@ -40,7 +41,8 @@ class TrainingConfig(Settings):
         average_over_scans: half-life, in scans, of the moving average of the weights; the averaged weights are
             validated and become the model. 0 for no averaging.
         precision: ``bf16`` computes convolutions and matrix products in 16 bits, sums and losses in 32. ``auto`` does
-            so where the machine has instructions for it; elsewhere 16 bits are many times slower.
+            so where the machine has instructions for it; elsewhere 16 bits are many times slower. ``tf32`` rounds what
+            a GPU multiplies to 11 digits; ``fp32`` rounds nothing.
         recompute: whether to drop the activations within blocks and compute them again for the gradients: less memory,
             the same gradients, about a third more operations.
         compile: whether to use ``torch.compile``, which needs a C++ compiler, and minutes before the first step.
@@ -66,7 +68,7 @@ class TrainingConfig(Settings):
     gradient_clip: Weight = 1.0
     average_over_scans: NotNegative = 1000
     accumulate: Count = 1
-    precision: Literal["fp32", "bf16", "auto"] = "fp32"
+    precision: Precision = "fp32"
     recompute: bool = False
     compile: bool = False
     augmentations: tuple[Augmentation, ...] = ()

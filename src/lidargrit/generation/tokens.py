@@ -21,7 +21,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
-from lidargrit.nn.precision import Precision, without_autocast
+from lidargrit.nn.precision import Precision, in_full, products_in
 from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
 from lidargrit.scans.bits import ScanBits
@@ -57,7 +57,7 @@ class DecodingOfTokens(Settings):
             sampled at once; 0 samples them independently.
         decoder: number type of the tokenizer's decoder and of the pixel decoder. ``fp32`` is exact; ``bf16`` is
             quicker, moves ranges a little and a few pixels to another surface; ``auto`` is ``bf16`` where the machine
-            has instructions for it.
+            has instructions for it. ``tf32`` rounds what a GPU multiplies to 11 digits.
     """
 
     mask: PixelChoice = "auto"
@@ -187,11 +187,13 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         for first in range(0, wanted, at_once):
             some = slice(first, first + at_once)
             grid = TokenGrid.unchecked(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
-            if self.pixels is not None and mask in ("auto", "pixels"):
-                part = None if condition is None else condition[some]
-                images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
-            else:
-                images.append(tokenizer.sample(grid, rngs[some], "threshold" if mask == "threshold" else "bernoulli"))
+            with products_in(pixels.precision):
+                if self.pixels is not None and mask in ("auto", "pixels"):
+                    part = None if condition is None else condition[some]
+                    images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
+                else:
+                    method = "threshold" if mask == "threshold" else "bernoulli"
+                    images.append(tokenizer.sample(grid, rngs[some], method))
         return RangeImage.cat(images)
 
     def observed_tokens(self, condition: Observed) -> Int[Tensor, "B T"]:
@@ -290,7 +292,7 @@ class PixelObjective(Objective):
         decoded = None
         if self._tokens is not None and self._decoding is not None:
             tokenizer = self._decoding.network(images.range_m.device)
-            with torch.no_grad(), without_autocast(images.range_m.device):  # as when scans are sampled
+            with torch.no_grad(), in_full(images.range_m.device):  # as when scans are sampled
                 decoded = tokenizer.decode(TokenGrid.unchecked(self._tokens(images).long(), tokenizer.num_codes))
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.precision import in_full
 from lidargrit.nn.processes import sample_from_all, sum_over_processes
 
 CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
@@ -57,7 +57,7 @@ class VectorQuantiser(nn.Module):
 
     def forward(self, z: Float[Tensor, "B D h w"], rng: torch.Generator | None = None) -> Quantised:
         """Replace every latent by its nearest code; ``rng`` chooses the latents that dead codes restart from."""
-        with without_autocast(z.device):  # codes lie too close together for 16 bits
+        with in_full(z.device):  # codes lie too close together for 16 bits
             return self._quantise(z.float(), rng)
 
     def _quantise(self, z: Tensor, rng: torch.Generator | None) -> Quantised:

@@ -24,7 +24,7 @@ from lidargrit.scans.types import RangeImage
 
 _SCANS = 2  # in a counted batch: some objectives compare the scans of a batch
 _STEPS_AT_MOST = 64  # that are counted; rarer terms hardly cost
-_A100_FP32_FLOPS_PER_S, _A100_BF16_FLOPS_PER_S = 19.5e12, 312e12
+_A100_FLOPS_PER_S = {"fp32": 19.5e12, "tf32": 156e12, "bf16": 312e12}
 _CORRECTIONS, _OVERSPENT_AT_MOST = 20, 0.02  # of a budget
 _GPU_FROM_FLOPS = 1e16  # less is a training of small batches, which wait for the launches of kernels
 _SHARE = 0.25  # of a peak: a guess for networks as small as these; small batches reach less
@@ -88,7 +88,7 @@ def computing_time(flops: int, precision: Precision) -> str:
     Source:
         Peaks of an NVIDIA A100 without sparsity: its datasheet, 2021.
     """
-    kind, peak = ("fp32", _A100_FP32_FLOPS_PER_S) if precision == "fp32" else ("bf16", _A100_BF16_FLOPS_PER_S)
+    kind = "bf16" if precision == "auto" else precision
     here = _cpu_flops_per_s()
     text = (
         f"{flops:.2e} floating-point operations, by estimate {duration(flops / (_SHARE * here))} on this machine's CPU "
@@ -96,6 +96,7 @@ def computing_time(flops: int, precision: Precision) -> str:
     )
     if flops < _GPU_FROM_FLOPS:
         return text
+    peak = _A100_FLOPS_PER_S[kind]
     there = duration(flops / (_SHARE * peak))
     return f"{text}, {there} on one A100 at {_SHARE:.0%} of its {peak / 1e12:g} TFLOP/s in {kind}"
 

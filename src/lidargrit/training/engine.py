@@ -18,7 +18,7 @@ from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ConfigError, LidarGritError, TrainingError
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.generation.objective import Objective
-from lidargrit.nn.precision import Precision, dtype_of
+from lidargrit.nn.precision import Precision, dtype_of, products_in
 from lidargrit.scans.example import Example
 
 
@@ -26,7 +26,7 @@ class Engine:
     """Runs an objective on this machine's device, in one process or in each of several under a launcher.
 
     Args:
-        precision: ``fp32``, ``bf16``, or ``auto`` for ``bf16`` where the machine has instructions for it.
+        precision: number type of products; ``auto`` is ``bf16`` where the machine has instructions for it.
         reaches_all_weights: whether every loss has a gradient in every weight; otherwise, as in adversarial training,
             processes do not wait for gradients that do not come.
     """
@@ -52,6 +52,7 @@ class Engine:
             strategy = DDPStrategy(find_unused_parameters=not reaches_all_weights)
             where = {"devices": here, "num_nodes": processes // here, "strategy": strategy}
             where["plugins"] = [TorchElasticEnvironment()]
+        self._precision: Precision = precision
         short = dtype_of(precision) == torch.bfloat16
         self._fabric: Any = Fabric(precision="bf16-mixed" if short else "32-true", **where)
         self._fabric.launch()
@@ -114,7 +115,8 @@ class Engine:
         self._objective.train()
         terms: dict[str, Tensor] = {}
         for player in _turns(self._objective.objective):
-            found, is_finite = self._step(example, seed, gradient_clip, player, parts)
+            with products_in(self._precision):
+                found, is_finite = self._step(example, seed, gradient_clip, player, parts)
             terms = _joined(terms, found, player)
             if not is_finite:
                 break
@@ -157,7 +159,7 @@ class Engine:
         was_training = objective.training
         objective.eval()
         terms: dict[str, Tensor] = {}
-        with torch.no_grad(), self._fabric.autocast():
+        with torch.no_grad(), self._fabric.autocast(), products_in(self._precision):
             for player in _turns(objective):
                 rng = torch.Generator(self.device).manual_seed(seed)
                 terms = _joined(terms, objective(example.to(self.device), rng, player), player)

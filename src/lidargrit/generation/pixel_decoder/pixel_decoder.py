@@ -51,7 +51,8 @@ class PixelSampling(Settings):
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
             so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
         precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
-            ``auto`` is ``bf16`` where the machine has instructions for it.
+            ``auto`` is ``bf16`` where the machine has instructions for it; ``tf32`` rounds what a GPU multiplies to 11
+            digits.
     """
 
     range_temperature: Temperature = 0.0

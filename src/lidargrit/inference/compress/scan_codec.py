@@ -19,6 +19,7 @@ from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.generation.tokens import TokenGenerator
 from lidargrit.inference.compress.coder import ONE, Coder, Decoder, Encoder, StepMixture, not_reproduced
 from lidargrit.inference.compress.rounding import MASK_LOGITS, Rounding, sigmoid
+from lidargrit.nn.precision import inference
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 from lidargrit.systems.multiscale.system import Multiscale
 
@@ -75,7 +76,7 @@ class ScanCodec:
                 found.update(weight.contiguous().numpy().astype("<f8").tobytes())
         return found.hexdigest()
 
-    @torch.no_grad()
+    @inference()
     def compress(self, image: RangeImage) -> bytes:
         """Return a range image (H, W) as bytes; rounding to the step moves ranges by half of it at most."""
         if image.range_m.ndim != 2 or not image.sensor.same_rays(self.sensor):
@@ -96,7 +97,7 @@ class ScanCodec:
         self.decompress(compressed)  # so that nothing is written that this machine could not read
         return compressed
 
-    @torch.no_grad()
+    @inference()
     def decompress(self, compressed: bytes) -> RangeImage:
         """Return the range image (H, W) that :meth:`compress` was given, its ranges rounded to the step."""
         if len(compressed) < _HASH_BYTES or (len(compressed) - _HASH_BYTES) % 4:

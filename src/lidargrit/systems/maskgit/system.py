@@ -44,7 +44,8 @@ class MaskedSampling(DecodingOfTokens):
             logarithm of a token's probability and falls to 0 with the last pass; 0 keeps the likeliest tokens, and the
             larger it is, the more random the order. The default is that of the authors' program.
         weights: number type of the transformer's products. ``fp32`` is exact; ``bf16`` computes them in 16 bits, as
-            training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it.
+            training does where that is quicker; ``auto`` is ``bf16`` where the machine has instructions for it;
+            ``tf32`` rounds what a GPU multiplies to 11 digits.
     """
 
     steps: Annotated[int, Bounds(1, STEPS_AT_MOST)] = 16

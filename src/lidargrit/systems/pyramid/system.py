@@ -21,6 +21,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling, nats_to_range_bits
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.nn.precision import inference
 from lidargrit.nn.random import rngs_of
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import Condition
@@ -107,7 +108,7 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
         return self._sampled([], rngs_of(seeds), sampling)
 
-    @torch.no_grad()
+    @inference()
     def resample(self, images: RangeImage, seeds: Sequence[int], levels: int = 2) -> RangeImage:
         """Return scans whose finest levels are sampled given the true coarser ones, which tell what these keep.
 

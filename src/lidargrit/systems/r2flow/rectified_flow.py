@@ -18,7 +18,7 @@ from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.precision import in_full
 from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
@@ -219,7 +219,7 @@ class FlowPairs(Frozen[Hdit]):
     def _clean(self, number: int, noise: Float[Tensor, "1 C H W"]) -> Float[Tensor, "1 C H W"]:
         end = self._kept.get(number)
         if end is None:
-            with without_autocast(noise.device):
+            with in_full(noise.device):
                 end = solve(self.network(noise.device), noise, self._solving).images
             end = as_kept(end, self._sensor).cpu()
             if len(self._kept) < self.kept_at_most:

@@ -17,6 +17,7 @@ from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, required_reflectance
 from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, labels_of, labels_to_learn
 from lidargrit.nn.flops import FlopCounter
+from lidargrit.nn.precision import inference
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
@@ -198,7 +199,7 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
         """Return the errors of the classes."""
         return SegmenterObjective(self.segmenter, self.sensor)
 
-    @torch.no_grad()
+    @inference()
     def segment(self, images: RangeImage) -> RangeImage:
         """Return scans with the likeliest class of each return as its label, each scan computed by itself.
 

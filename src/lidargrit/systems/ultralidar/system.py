@@ -17,7 +17,7 @@ from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.precision import in_full, inference
 from lidargrit.nn.processes import of_first_process, sample_from_all, sum_over_processes
 from lidargrit.nn.random import gumbel_of, sample_index
 from lidargrit.scans.condition import Condition
@@ -93,7 +93,7 @@ class CodebookCare(nn.Module):
         if idle.is_meta:  # without values, where operations are only counted: k-means is rare
             return
         if int(self.rest_steps) == 0 and float(idle.float().mean()) > _IDLE_SHARE:
-            with without_autocast(codes.device):  # codes lie too close together for 16 bits
+            with in_full(codes.device):  # codes lie too close together for 16 bits
                 codes.copy_(of_first_process(self._moved(codes, idle, rng)))
             self.idle_steps.zero_()
             self.rest_steps.fill_(_REST_STEPS)
@@ -194,7 +194,7 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
             return VoxelReconstruction(self.autoencoder, self.sensor, self.config.flips)
         return HiddenVoxelTokens(self.autoencoder, self.prior, self.sensor, self.config.flips)
 
-    @torch.no_grad()
+    @inference()
     def sample_voxels(self, seeds: Sequence[int], sampling: VoxelSampling | None = None) -> Bool[Tensor, "B z y x"]:
         """Return the occupied voxels of new scans: those whose range images :meth:`sample` returns.
 
@@ -314,7 +314,7 @@ class HiddenVoxelTokens(Objective):
         images = example.images
         autoencoder = self._frozen.network(images.range_m.device)
         voxels = _training_voxels(images, autoencoder.config.grid, self._flips, rng)
-        with torch.no_grad(), without_autocast(voxels.device):  # tokens as outside of training
+        with torch.no_grad(), in_full(voxels.device):  # tokens as outside of training
             tokens = autoencoder.tokens(voxels)
             codes = autoencoder.codes(tokens)
         progress = torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
