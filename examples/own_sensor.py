@@ -10,11 +10,13 @@ from lidargrit.scans.fit_sensor import fit_sensor
 from lidargrit.scans.fit_sensor.table import as_table
 from lidargrit.viewer.sensor_fit import plot_sensor_fit
 
+COUNT = 10  # scans; five or more show all rings
+
 
 def main(folder: Path, sensor_file: Path | None = None) -> None:
-    """Fit a sensor to ten scans that do not tell their rings, and show the fit."""
+    """Fit a sensor to some scans that do not tell their rings, and show the fit."""
     unknown = lidargrit.load_sensor("vlp16")
-    scans = [replace(lidargrit.simulate(seed, unknown), ring=None) for seed in range(10)]
+    scans = [replace(lidargrit.simulate(seed, unknown), ring=None) for seed in range(COUNT)]
     fit = fit_sensor(scans, "mine")
     print(as_table(fit))
     plot_sensor_fit(fit, folder / "own_sensor.png")

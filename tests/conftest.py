@@ -1,12 +1,15 @@
 """What tests share: where the reference numbers and the real scans lie, if they lie beside the project."""
 
 import compileall
+import copy
 import functools
 import inspect
 import itertools
+import json
 import os
 import re
 import signal
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -32,7 +35,8 @@ os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 torch.set_num_threads(1)  # two threads while another process runs can be many times slower
 
 with_shapes_checked = jaxtyping.jaxtyped
-CHECKED_CALLS = 8  # of each function in each test
+CHECKED_CALLS = 2  # of each function in each test
+STREETS_KEPT = 50  # of 3 MB each
 test_number = itertools.count()
 running_test = next(test_number)
 
@@ -78,6 +82,28 @@ def _cache(tmp_path_factory):
     """Project scans once for all tests, and leave the user's own cache alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LIDARGRIT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _streets():
+    """Simulate each street of a source such as ``simulated:4`` once for all tests that read it in one process."""
+    from lidargrit.data.datasets.simulated import Simulated  # now its functions come with their checks
+
+    simulated, kept = Simulated.scan, OrderedDict()
+
+    @functools.wraps(simulated)
+    def scan(streets, index):
+        street = (streets.seeds[index], json.dumps(streets.made_by.to_json()))
+        found = kept.get(street)  # threads may ask at once
+        if found is None:
+            found = kept[street] = simulated(streets, index)
+            if len(kept) > STREETS_KEPT:
+                kept.popitem(last=False)
+        return copy.deepcopy(found)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Simulated, "scan", scan)
         yield
 
 

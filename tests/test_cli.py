@@ -306,6 +306,7 @@ def test_doctor_tells_versions_and_room(typed):
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
     monkeypatch.setattr(*ONE_METRIC)
     monkeypatch.setattr("lidargrit.viewer.demo.measure", lambda _preset: [])  # seconds, for an estimate
+    monkeypatch.setattr("lidargrit.viewer._matplotlib._DOTS_PER_INCH", 20)
     monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 11)  # as many as its pictures show
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)

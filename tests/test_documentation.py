@@ -158,7 +158,7 @@ def test_pictures_are_small_and_shown():
 @pytest.fixture(scope="module")
 def tiny_run(tmp_path_factory):
     """Return a run of random weights, for examples that take the packaged one if they are told no other."""
-    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(256)
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
     pixels = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, range_width=4, blocks=1)
     model = LidarGrit(replace(LidarGrit.smallest_config(sensor), pixels=pixels), sensor)
     model.save(folder := tmp_path_factory.mktemp("run"))

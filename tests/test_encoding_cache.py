@@ -7,6 +7,7 @@ from torch import nn
 
 from lidargrit.generation.encoding_cache import EncodingCache
 from lidargrit.generation.presets import load_preset
+from lidargrit.scans.example import Example, keys_of
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.training.measure import measure
@@ -83,3 +84,14 @@ def test_a_measured_stage_encodes_other_images_in_every_step(monkeypatch):
     measure(preset)
     new = [some for some in encoded if not some.range_m.is_meta]  # the others are of counted operations
     assert len(new) == 4 * batch, "one to warm up, and three timed steps"
+
+
+def test_a_key_that_comes_with_an_image_is_trusted():
+    network, images = Half(), scans(2)
+    cache, example = EncodingCache(network, Half.forward), Example(images).with_keys()
+    assert example.keys == keys_of(images)
+    assert example[[1]].keys == example[1:].keys == keys_of(images[1:])
+    together = cache(example.images, example.keys)
+    assert torch.equal(cache(images), together), "by the hashes of the same pixels"
+    assert torch.equal(cache(images[[1, 0]], example.keys), together), "by the keys, whatever the pixels"
+    assert network.batches == [1, 1]

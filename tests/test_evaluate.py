@@ -85,7 +85,8 @@ def test_a_protocol_asks_for_what_there_is(name):
     sensor = protocol.load_sensor()
     assert (sensor is None) == (name in ("exact", "objects", "streets"))
     if sensor is not None:
-        assert (sensor.height, sensor.width) == (64, 256 if name.endswith("odometry") else 1024)
+        rows = 32 if protocol.data_set == "nuscenes" else 64
+        assert (sensor.height, sensor.width) == (rows, 256 if name.endswith("odometry") else 1024)
         assert protocol.data_set in discovery.names("datasets")
     assert 20 < len(discovery.summary("protocols", name)) < 180
 
@@ -132,6 +133,7 @@ def test_the_same_again_gives_the_same(card, sets):
     without = [replace(score, seconds=0.0) for score in card.scores]
     assert [replace(score, seconds=0.0) for score in again.scores] == without
     assert again.samples == card.samples
+    assert {len(each) for each in (card.about["sha256"], card.versions["source_sha256"])} == {64}
 
 
 def test_no_intervals_where_none_are_wanted(card, sets):
@@ -270,6 +272,11 @@ def test_a_scorecard_is_read_back_and_nothing_else_is(card, tmp_path):
     again = Scorecard.read(path)
     assert again.as_table() == card.as_table()
     assert again.samples == card.samples
+    assert {len(each) for each in (card.about["sha256"], card.versions["source_sha256"])} == {64}
+    altered = path.read_text().replace('"scans_used": 10', '"scans_used": 11')
+    path.write_text(altered)
+    with pytest.raises(DataError, match=r"scores\.json, which was altered after it was written"):
+        Scorecard.read(path)
     for bad in ("[]", "{}", "nonsense", '{"protocol": 1}', "[" * 100000):
         path.write_text(bad)
         with pytest.raises(DataError, match=r"scores\.json, which cannot be used"):

@@ -235,8 +235,8 @@ from lidargrit.data.drives import DriveConfig, write_drives
 
 COMMANDS = {
     "simulate": lambda out: write_drives(out, 6, DriveConfig(load_sensor("vlp16"))),
-    "export": lambda out: export_scans("simulated:6", out, "pcd"),
-    "prepare": lambda out: prepare("simulated:6", DataConfig(workers=1), out),
+    "export": lambda out: export_scans("simulated:6@vlp16", out, "pcd"),
+    "prepare": lambda out: prepare("simulated:6@vlp16", DataConfig(sensor="vlp16", workers=1), out),
 }
 
 def begun(command, out):

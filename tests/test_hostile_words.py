@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from lidargrit.data.datasets import load
 from tiny_runs import the_one_line
 
@@ -24,15 +22,22 @@ def python(words: list[str | bytes], folder: Path, environment: dict[str, str]) 
     return done.returncode, "".join(line for line in told if not line.endswith(("libraries\n", "ago\n")))
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["straße.bin".encode(), "走.json".encode(), b"\xff.bin", b"x" * 300],
-    ids=["German", "Chinese", "no UTF-8", "long"],
-)
-def test_names_of_missing_files_under_the_c_locale(name, tmp_path):
-    code, output = python(["-m", "lidargrit", "inspect", name], tmp_path, ASCII)
-    assert code == 2
-    the_one_line(output, "inspect")
+EACH = """
+import sys
+from lidargrit.cli import main
+sys.exit({main(["inspect", name]) for name in sys.argv[1:]} != {2})
+"""
+
+
+def test_names_of_missing_files_under_the_c_locale(tmp_path):
+    """German, Chinese, no UTF-8, and too long."""
+    names = ["straße.bin".encode(), "走.json".encode(), b"\xff.bin", b"x" * 300]
+    code, output = python(["-c", EACH, *names], tmp_path, ASCII)
+    assert code == 0
+    lines = output.splitlines()
+    assert len(lines) == len(names)
+    for line in lines:
+        the_one_line(line, "inspect")
 
 
 SEVERAL = """

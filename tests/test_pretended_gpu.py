@@ -1,20 +1,24 @@
 """What a GPU would be asked for, counted without one: kernels, waits of the host, and copies to the device."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 
 from lidargrit.generation.batches import BatchSeeds
+from lidargrit.generation.generator import load_class
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.scans.condition import NOTHING
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling, sample_token
-from pretended_gpu import DEVICE, Counts, counted
+from lidargrit.training.compute import uniform_images
+from pretended_gpu import DEVICE, Counts, PretendedGenerator, counted
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
 TOKEN_STEPS = ("nn/decoding.py", "nn/random.py")
@@ -121,3 +125,47 @@ def test_no_recorded_step_of_tokens_waits_for_the_device(small: LidarGrit) -> No
     assert (counts.reads.total(), counts.uploads.total()) == (0, 0), str(counts)
     with counted():
         assert tokens.tolist() == plain.tolist()
+
+
+STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: kernels, reads and uploads at most
+    "completion/completion": (1130, 22, 2),
+    "dusty/adversarial": (670, 1, 0),
+    "lidargan/adversarial": (640, 22, 6),
+    "lidargen/score": (2070, 0, 0),
+    "lidargrit/tokenizer": (720, 0, 0),
+    "lidargrit/transformer": (115, 0, 0),
+    "lidargrit/pixels": (1110, 0, 0),
+    "lidarvae/autoencoder": (310, 11, 3),
+    "lidm/tokenizer": (690, 0, 0),
+    "lidm/denoiser": (690, 0, 0),
+    "maskgit/tokenizer": (720, 0, 0),
+    "maskgit/transformer": (130, 0, 0),
+    "multiscale/pixels": (1480, 0, 0),
+    "pyramid/levels": (2500, 1, 0),
+    "r2dm/diffusion": (570, 0, 0),
+    "r2flow/flow": (880, 0, 0),
+}
+
+
+@pytest.mark.parametrize("stage", STEPS)
+def test_a_step_of_training_asks_no_more_of_the_device_than_is_known(stage: str) -> None:
+    system, name = stage.split("/")
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+    cls = load_class(system)
+    config = cls.smallest_config(sensor)
+    if name == "pixels" and system == "lidargrit":
+        config = replace(config, pixels=PixelDecoderConfig(4, mask_width=4, range_width=4))
+    torch.manual_seed(0)
+    objective = cls(config, sensor).objective(name).train()
+    example = Example(uniform_images(sensor, 2)).with_keys()
+    with counted():
+        objective.to(DEVICE)
+        example = example.to(DEVICE)
+        if objective.keeps_encodings:
+            objective(example, PretendedGenerator().manual_seed(0))  # encodes the images
+    with counted() as counts:
+        for player in objective.players or ("",):
+            objective(example, PretendedGenerator().manual_seed(0), player)["loss"].backward()
+    assert totals(counts)[0] > 50
+    for found, at_most in zip(totals(counts), STEPS[stage], strict=True):
+        assert found <= at_most, str(counts)

@@ -24,6 +24,7 @@ from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.datasets.shared import files as _files
 from lidargrit.data.images import Provenance
 from lidargrit.data.sources import data_set_of
+from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.presets import load_preset
 from lidargrit.publishing import publish
@@ -102,7 +103,7 @@ def test_recordings_that_are_paths_are_not_published(run, tmp_path):
 def test_the_card_tells_the_facts(run, tmp_path):
     told = json.loads((run.parent / "scores.json").read_text())
     told["inputs"]["samples"]["source"], told["warnings"] = "clients/acme corp/smp", ["clients/acme corp/smp overlap"]
-    (tmp_path / "told.json").write_text(json.dumps(told))
+    write_json(tmp_path / "told.json", Scorecard.from_json(told).to_json())
     assert main(["publish", str(run), str(tmp_path / "public"), "--scores", str(tmp_path / "told.json")]) == 0
     head, body = head_of((tmp_path / "public" / "README.md").read_text())
     assert head == {
@@ -138,7 +139,7 @@ def test_a_short_name_of_samples_does_not_change_words_in_sentences(run, tmp_pat
     told = json.loads((run.parent / "scores.json").read_text())
     told["inputs"]["samples"]["source"], told["warnings"] = source, [f"{source} and the reference overlap"]
     told["deviations"] = ["the samples are projected by 'exact', not by 'reference'"]
-    (tmp_path / "told.json").write_text(json.dumps(told))
+    write_json(tmp_path / "told.json", Scorecard.from_json(told).to_json())
     card = publish(run, tmp_path / "public", tmp_path / "told.json")
     assert "- not as in the protocol: the samples are projected by 'exact', not by 'reference'" in card.splitlines()
     assert "- warning: the samples and the reference overlap" in card.splitlines()

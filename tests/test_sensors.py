@@ -20,6 +20,7 @@ from lidargrit.scans.types import RangeImage, Scan
 NAMES = discovery.names("sensors")
 SIZES = {  # rows and columns, top and bottom row in degrees, from the makers' tables
     "hdl32e": (32, 1084, 10.67, -30.67),
+    "hdl32e_nuscenes": (32, 1024, 9.375, -29.375),
     "hdl64e_kitti_360": (64, 1024, 2.78125, -24.78125),
     "hdl64e_kitti_odometry": (64, 256, 2.60, -23.64),
     "os1_128": (128, 1024, 20.95, -21.82),

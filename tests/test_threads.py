@@ -19,7 +19,7 @@ import os, sys
 from lidargrit.cli import main
 {before}
 loaded = "torch" in sys.modules
-main(["list", "sensors"])
+main(["list", "presets"])
 print(loaded, *(os.environ.get(name, "unset") for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")), file=sys.stderr)
 """
 

@@ -81,6 +81,20 @@ def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--world-size", type=int, help=size)
 
 
+def add_ray(parser: argparse.ArgumentParser) -> None:
+    """Add ``--ray``, for work that the machines of a cluster share."""
+    address = "Ray cluster that does the work: auto, HOST:PORT or ray://HOST:PORT"
+    parser.add_argument("--ray", default="", metavar="ADDRESS", help=address)
+
+
+def ray_address(options: argparse.Namespace) -> str:
+    """Return the address of the cluster, "" for none; refuse a rank beside it."""
+    if options.ray and (options.rank, options.world_size) != (None, None):
+        got = f"--ray {options.ray} with --rank or --world-size"
+        raise ConfigError(got, "one of them", "leave --rank and --world-size out: the cluster divides the work")
+    return options.ray
+
+
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add ``--device``."""
     device = "cpu or cuda:1 (default: a GPU, if there is one)"

@@ -11,7 +11,7 @@ from lidargrit.core.untrusted import seed_number, whole_number
 EXAMPLES = """\
   lidargrit compare table lidargrit_small r2dm_small --flops 2e14 -n 1000      equal compute for all
   lidargrit compare table runs/mine their_samples --reference /data/held_out   is the second better than the first?
-  lidargrit compare table --add runs/another                          as the others of the table were compared
+  lidargrit compare table --add runs/another theirs.json              as the others of the table were compared
   lidargrit compare paper --paper-table 3 --data /data/kitti_odometry --dry-run    --data simulated --small: minutes
   lidargrit compare filled pretrained linear --protocol completion --observed rows:8 --reference /data/held_out
 """
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(goes_on=True)
     add = parser.add_argument
     add("out", type=Path, help="folder for runs, samples and scores; the same command continues there")
-    what = "preset, run or samples; SYSTEM:NAME=VALUE,... sets how it is sampled"
+    what = "preset, run, samples or scores (.json); SYSTEM:NAME=VALUE,... sets how it is sampled"
     add("systems", nargs="*", metavar="SYSTEM", help=what)
     add("--add", nargs="+", default=[], metavar="SYSTEM", help="further systems for the table in OUT")
     # No defaults here: beside --add any of these is refused.

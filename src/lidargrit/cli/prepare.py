@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from lidargrit.cli._options import add_count, add_rank, add_scans, scan_settings
+from lidargrit.cli._options import add_count, add_rank, add_ray, add_scans, ray_address, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 
 EXAMPLES = """\
@@ -12,6 +12,7 @@ EXAMPLES = """\
   lidargrit train lidargrit_kitti_360 runs/mine --set data.train=/fast/kitti_360_train data.val=...
   lidargrit prepare /data/my_scans --sensor my_sensor.json       into the cache, where train finds it
   lidargrit prepare /data/scans -o /shared/scans --rank 3 --world-size 8       one of eight machines
+  lidargrit prepare /data/scans -o /shared/scans --ray auto                    all machines of a Ray cluster
 """
 
 
@@ -24,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scans(parser)
     parser.add_argument("--workers", type=int, help="number of processes on this machine (default: 2)")
     add_rank(parser, "machine")
+    add_ray(parser)
     parser.add_argument("--verify", action="store_true", help="also read all back, and prepare damaged parts anew")
     add_json(parser)
 
@@ -33,10 +35,11 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.data.sources import open_source
 
     refuse_taken(options)
+    address = ray_address(options)
     machines = (options.rank, options.world_size)
     settings = scan_settings(options, max_scans=options.count, workers=options.workers)
     source = open_source(options.scans, settings.data.bad_points)
     dataset = source.scans()
     config = replace(settings.data, sensor=settings.sensor or source.sensor_name)
-    made = prepare_and_describe(options.scans, dataset, config, options.out, *machines, options.verify)
+    made = prepare_and_describe(options.scans, dataset, config, options.out, *machines, options.verify, address)
     print_result(options, made.as_text(), made.to_json())

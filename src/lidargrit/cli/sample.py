@@ -4,7 +4,7 @@ import argparse
 import os
 from pathlib import Path
 
-from lidargrit.cli._options import add_device, add_rank, add_settings, sampling_words
+from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words
 from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row
@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
     add_settings(parser, "settings of sampling, such as sampling.temperature=1.1; see: lidargrit list generators")
     add_rank(parser, "process")
+    add_ray(parser)
     add_device(parser)
 
 
@@ -36,16 +37,18 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.processes import rank_and_world_size
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
-    from lidargrit.inference.samples import write_samples
+    from lidargrit.inference.samples import write_samples, write_samples_on_ray
     from lidargrit.nn.devices import usable_device
 
     seeds = seeds_in_a_row(options.seed, options.count)
-    rank, world_size = rank_and_world_size(options.rank, options.world_size)
-    own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-    device = usable_device(options.device or own)
-    run_folder = locate(options.run_folder)
-    generator = load(run_folder).to(device)
-    sampling = generator.parse_sampling(sampling_words(options.set))
-    seeds = seeds[rank::world_size]
-    write_samples(generator, run_folder, options.out, seeds, sampling)
+    address, words = ray_address(options), sampling_words(options.set)
+    if address:
+        write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
+    else:
+        rank, world_size = rank_and_world_size(options.rank, options.world_size)
+        own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
+        device, run_folder = usable_device(options.device or own), locate(options.run_folder)
+        generator = load(run_folder).to(device)
+        seeds = seeds[rank::world_size]
+        write_samples(generator, run_folder, options.out, seeds, generator.parse_sampling(words))
     print(f"done: {counted_scans(len(seeds))} in {options.out}; {look_at(options.out)}")

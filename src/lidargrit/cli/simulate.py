@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from lidargrit.cli._options import add_ray
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number
 
@@ -29,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--wet", type=float, default=0.0, help="wetness of the ground, from 0 (dry) to 1")
     add("--clean", action="store_true", help="also write clean ranges and return probabilities, as .npz")
     add("--workers", type=int, default=2, help="number of processes")
+    add_ray(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -37,6 +39,6 @@ def run(options: argparse.Namespace) -> None:
 
     settings = {name: vars(options)[name] for name in ("seed", "frames", "theme", "motion", "wet", "clean")}
     config = DriveConfig(load_sensor(options.sensor), **settings)
-    there = write_drives(options.out, options.count, config, options.workers)
+    there = write_drives(options.out, options.count, config, options.workers, options.ray)
     theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
     print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}{theirs}")

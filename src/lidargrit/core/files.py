@@ -304,6 +304,11 @@ def _unreadable(error: type[LidarGritError], path: Path, why: Exception, wanted:
     return error(f"{path}, which cannot be read ({reason})", wanted, cure)
 
 
+def sha256_of_json(data: Any) -> str:
+    """Return the SHA-256 hash of plain values, whatever the order of names and the layout of their file."""
+    return hashlib.sha256(json.dumps(plain(data), sort_keys=True).encode()).hexdigest()
+
+
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 hash of a file of any size, in hexadecimal digits."""
     with path.open("rb") as file:

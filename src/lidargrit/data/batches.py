@@ -29,6 +29,7 @@ class Batches:
         rank: number of this process, from 0; it takes its share of every batch.
         world_size: number of processes that train together.
         condition_of: function from a batch of images to what a generator is told of each; nothing if not given.
+        with_keys: whether images come with keys, by which what is computed of them is known again.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class Batches:
         world_size: int = 1,
         workers: int = 1,
         condition_of: Callable[[RangeImage], Condition] | None = None,
+        with_keys: bool = False,
     ) -> None:
         if batch_size % world_size:
             raise ConfigError(
@@ -51,7 +53,7 @@ class Batches:
             )
         self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
         self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
-        self.workers, self._condition_of = workers, condition_of
+        self.workers, self._condition_of, self._with_keys = workers, condition_of, with_keys
         self._epoch, self._order = -1, torch.empty(0)
 
     def stream(self, scans_seen: int, until: int) -> Iterator[Example]:
@@ -87,7 +89,8 @@ class Batches:
         if self.augmentations:
             each = [augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)]
             images = RangeImage.stack(each)
-        return Example(images, NOTHING if self._condition_of is None else self._condition_of(images))
+        example = Example(images, NOTHING if self._condition_of is None else self._condition_of(images))
+        return example.with_keys() if self._with_keys else example
 
     def _scan_at(self, position: int) -> int:
         epoch, index = divmod(position, len(self.images))

@@ -1,5 +1,6 @@
 """Simulated drives as files: seeds → a tree laid out as KITTI odometry and SemanticKITTI are."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from lidargrit.core.files import (
     write_json,
     write_text,
 )
-from lidargrit.core.processes import process_pool
+from lidargrit.core.shares import each_done
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import begun_by
@@ -25,6 +26,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, poses_of
 
 MANIFEST = "simulated.json"
+_SHARE, _SHARE_ON_RAY = 4, 16  # scans: seconds of work, for a task takes a cluster 30 ms
 _SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
 # KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
 _CAMERA_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -74,7 +76,7 @@ class DriveConfig:
         return {**vars(self), "sensor": self.sensor.to_json(), "streets": STREETS_VERSION}
 
 
-def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1) -> int:
+def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1, ray: str = "") -> int:
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
     The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
@@ -85,6 +87,7 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
         out: an empty folder, or a folder that the same simulation began; scans can be added to it.
         num_scans: total number of scans.
         workers: number of parallel processes.
+        ray: address of a Ray cluster that simulates in place of processes; see :func:`each_done`.
 
     Returns:
         Number of scans that are there now.
@@ -102,16 +105,11 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
         _claim(out, config)
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
         missing = [scan for scan in range(there) if not _label_file(out, config, scan).exists()]
-        write = partial(_write_scan, out, config)
+        size = _SHARE_ON_RAY if ray else _SHARE
+        shares = [missing[first : first + size] for first in range(0, len(missing), size)]
         with reporting.progress("simulating", there, there - len(missing)) as progress:
-            if min(workers, len(missing)) <= 1:
-                for scan in missing:
-                    write(scan)
-                    progress.advance(1)
-            else:
-                with process_pool(workers) as pool:
-                    for _ in pool.map(write, missing, chunksize=4):
-                        progress.advance(1)
+            for count in each_done(partial(_write_scans, out, config), shares, workers, ray):
+                progress.advance(count)
         _write_sequence_files(out, config, there)
     return there
 
@@ -121,6 +119,14 @@ def _claim(out: Path, config: DriveConfig) -> None:
     other = "which holds scans simulated in another way"
     if begun_by(out / MANIFEST, lambda there: "" if there == facts else other) is None:
         write_json(out / MANIFEST, facts)
+
+
+def _write_scans(out: Path, config: DriveConfig, scans: Sequence[int]) -> int:
+    """Write those scans that are not there, and return how many are then."""
+    for scan in scans:
+        if not _label_file(out, config, scan).exists():
+            _write_scan(out, config, scan)
+    return len(scans)
 
 
 def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:

@@ -42,6 +42,7 @@ from lidargrit.training import check_folder, train, with_budget
 from lidargrit.training.compute import duration
 from lidargrit.training.plan import check_stages
 
+_SCORES = ".json"  # what evaluate --json wrote
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
@@ -91,8 +92,8 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: i
 
     Args:
         systems: names of presets or folders of finished runs, each with sampling choices after a colon if wanted:
-            ``r2dm_small:steps=32``; or folders of samples, of ours or of another program. A preset that occurs with
-            several sampling choices is trained once.
+            ``r2dm_small:steps=32``; or folders of samples, of ours or of another program; or files of scores, which
+            are taken as they are. A preset that occurs with several sampling choices is trained once.
         folder: output folder. It gets a run folder ``runs/PRESET``, and for each system ``SYSTEM/samples``, scores in
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
         benchmark: settings that all systems share.
@@ -152,7 +153,8 @@ def _require_a_metric(settings: EvalConfig) -> None:
 def _check_reference(reference: Source, plans: "Sequence[_Plan]", benchmark: Benchmark) -> None:
     """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
     config = benchmark.evaluation().data_config()
-    for sensor in {json.dumps(plan.sensor.to_json()): plan.sensor for plan in plans}.values():
+    sensors = [plan.sensor for plan in plans if plan.sensor is not None]
+    for sensor in {json.dumps(sensor.to_json()): sensor for sensor in sensors}.values():
         images = reference.images(sensor, config)
         require_same_rays(sensor, images.sensor)
         images.batch([0])  # the size of a file is known once it is read
@@ -193,6 +195,10 @@ def _finish(plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark, refere
         reporting.message(f"{name}:")
         if plan.samples is not None:
             _score_samples(plan.samples, folder / name, benchmark, reference)
+            continue
+        if plan.card is not None:
+            write_json(folder / name / f"{name}.json", plan.card.to_json())
+            Costs(folder / name / COSTS, plan.card.samples.weights_sha256).write_unknown()
             continue
         generator = load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run)
         generator.to(usable_device(""))
@@ -245,6 +251,8 @@ def _of_first_seeds(pair: EvalPair, folder: Path) -> EvalPair:
 
 def _folder_name(system: str) -> str:
     """Return the name of a system's folder in the table; "." and ".." stand for the folders that they name."""
+    if system.endswith(_SCORES):
+        return Path(system).stem
     run, colon, settings = system.partition(":")
     return (run if run.strip("./") else Path(run).resolve().name).replace("/", "_") + colon + settings.replace("/", "_")
 
@@ -294,19 +302,24 @@ class _Plan:
     """How one system is made: from a finished run, or by training a preset; or its samples, which are there.
 
     Args:
-        run: folder of a finished run, or of the one that the preset gets, or of samples.
+        run: folder of a finished run, or of the one that the preset gets, or of samples; or a file of scores.
         preset: preset that is trained; None for a finished run.
+        sensor: sensor of the scans; None for scores alone.
     """
 
     system: str
     run: Path
     preset: Preset | None
     sampling: object
-    sensor: SensorModel
+    sensor: SensorModel | None
     samples: Source | None = None
+    card: Scorecard | None = None
 
     @classmethod
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> "_Plan":
+        if system.endswith(_SCORES):
+            path, taken = Path(system), folder / _folder_name(system) / f"{_folder_name(system)}{_SCORES}"
+            return cls(system, path, None, None, None, card=Scorecard.read(path if path.is_file() else taken))
         name, settings = name_and_settings(system)
         run, trained = locate(name), folder / "runs" / name
         if is_run(run):

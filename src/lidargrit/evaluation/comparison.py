@@ -10,7 +10,7 @@ from typing import Any
 from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, LidarGritError, nearest_names, one_of
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
-from lidargrit.core.version import __version__
+from lidargrit.core.version import __version__, source_sha256
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import RunSource, Source, open_source
 from lidargrit.evaluation.intervals import Resampling, Score
@@ -277,6 +277,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
     return Scorecard(
         public_name(settings.protocol),
         {
+            "sha256": protocol.sha256,
             "title": protocol.title,
             "source": protocol.source,
             "range_m": protocol.range_m,
@@ -293,6 +294,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
         settings.facts(),
         {
             "lidargrit": __version__,
+            "source_sha256": source_sha256(),
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in ("torch", "numpy", "scipy")},
         },

@@ -66,10 +66,10 @@ class Interval:
             Student's 97.5 % quantile: 2.13 for 16 groups and 20 halves (1.96 for many), since few halves give only a
             rough standard error.
         high: value plus t standard errors, clipped to the metric's bounds.
-        mean_of_halves: mean score of half-samples, which have as many scans as the halves of real against real; None in
-            files of earlier versions.
-        values: scores of the half-samples; none in files of earlier versions. Systems that were scored alike, against
-            the same scans, have the same halves of these.
+        mean_of_halves: mean score of half-samples, which have as many scans as the halves of real against real; None if
+            it is not known.
+        values: scores of the half-samples; none if they are not known. Systems that were scored alike, against the same
+            scans, have the same halves of these.
     """
 
     low: float
@@ -88,7 +88,7 @@ class RealAgainstReal:
         value: mean over halvings of the reference, one half against the other.
         num_scans: number of scans in each half, on average. Most metrics fall as sets grow, some by a third where they
             double: so compare it with ``Interval.mean_of_halves``.
-        spread: standard deviation of the scores of single halvings; None in files of earlier versions.
+        spread: standard deviation of the scores of single halvings; None if it is not known.
     """
 
     value: float

@@ -14,7 +14,7 @@ import numpy as np
 from lidargrit.core.arrays import open_archive, read_member
 from lidargrit.core.configuration import rebuilt
 from lidargrit.core.errors import ConfigError, DataError, LidarGritError, counted_scans, without_folders
-from lidargrit.core.files import atomic_path
+from lidargrit.core.files import atomic_path, sha256_of_json
 from lidargrit.core.untrusted import check_path, parse_json
 from lidargrit.core.version import __version__
 from lidargrit.data.formats import open_file
@@ -31,7 +31,7 @@ from lidargrit.scans.sensors import SensorModel
 
 ENDING = ".lgref"
 METRIC_BYTES_AT_MOST = 192 << 20
-"""Bytes that a metric may keep unless a user names it: moments of 10,000 clouds take 145 MB, patches of 5,000 750 MB."""
+"""Bytes that a metric may keep unless a user names it: 10,000 scans take 145 MB in moments, 5,000 750 in patches."""
 _ABOUT = "about.npy"  # JSON as an array of bytes: the file is an .npz
 _WANTED = "a reference file of this version"
 _CURE = "get it again, or make one with: lidargrit evaluate DATA --save-reference FILE"
@@ -104,7 +104,7 @@ class ReferenceFile:
             data = self._array(archive, _ABOUT).tobytes()
         about = parse_json(data, str(path), dict, DataError, _WANTED, _CURE)
         self.sha256 = str(about.pop("sha256", ""))
-        if self.sha256 != _sha256_of(about):
+        if self.sha256 != sha256_of_json(about):
             raise DataError(f"{path}, which was altered after it was written", _WANTED, _CURE)
         try:
             self.sensor = SensorModel.from_json(about.pop("sensor"))
@@ -303,7 +303,7 @@ def write_reference(
     )
     about = {**asdict(contents), "sensor": scans.images.sensor.to_json()}
     about = json.loads(json.dumps(about))
-    about["sha256"] = _sha256_of(about)
+    about["sha256"] = sha256_of_json(about)
     arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, array in arrays.items():
@@ -347,7 +347,3 @@ def _sha256_of_array(array: np.ndarray) -> str:
     content = hashlib.sha256(f"{array.dtype.str} {array.shape} ".encode())
     content.update(array.tobytes())
     return content.hexdigest()[:32]
-
-
-def _sha256_of(about: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()

@@ -6,7 +6,7 @@ from typing import Any
 
 from lidargrit.core.configuration import hints_of, rebuilt
 from lidargrit.core.errors import DataError
-from lidargrit.core.files import read_json
+from lidargrit.core.files import read_json, sha256_of_json
 from lidargrit.core.table import Table
 from lidargrit.evaluation.intervals import Score, format_value
 from lidargrit.evaluation.verdict import Verdict, notes_on_floors, verdict
@@ -89,8 +89,8 @@ class Scorecard:
         return verdict(self.scores, self.reference.scans_used, left_out, self.leak)
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything as plain values, for a file."""
-        return {
+        """Return everything as plain values, for a file, with a hash of all: :meth:`read` refuses what was altered."""
+        data = {
             "protocol": {"name": self.protocol, **self.about},
             "samples": self.samples.source,
             "reference": self.reference.source,
@@ -113,13 +113,14 @@ class Scorecard:
             ],
             "left_out": [asdict(each) for each in self.left_out],
         }
+        return {**data, "sha256": sha256_of_json(data)}
 
     @classmethod
     def read(cls, path: Path) -> "Scorecard":
         """Read what :meth:`to_json` returned from a file.
 
         Raises:
-            DataError: the file cannot be read or holds something else.
+            DataError: the file cannot be read, holds something else, or was altered.
         """
         wanted, cure = "the scores that lidargrit evaluate --json wrote", "check the path, or evaluate again"
         try:
@@ -128,7 +129,10 @@ class Scorecard:
                 wanted = "scores of samples, which tables set side by side"
                 cure = "generate samples first with: lidargrit sample RUN FOLDER, and evaluate these"
                 raise DataError(f"{path}, which holds errors of reconstruction", wanted, cure)
-            return cls.from_json(data)
+            card = cls.from_json(data)
+            if data.pop("sha256", "") != sha256_of_json(data):
+                raise DataError(f"{path}, which was altered after it was written", wanted, cure)
+            return card
         except DataError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:

@@ -44,10 +44,12 @@ class Comparison:
     Args:
         differences: score of the one minus that of the other, by metric and variant; the 95 % of the intervals are of
             all metrics together, so that two equal systems seldom differ in any.
+        lost: metrics by which the one is worse.
     """
 
     differences: Mapping[Column, Estimate]
     verdict: Verdict
+    lost: tuple[Column, ...] = ()
 
 
 def side_by_side(paths: Sequence[Path]) -> list[Table]:
@@ -131,7 +133,8 @@ def judge(cards: Sequence[NamedCard]) -> Judged:
 
 
 def _differences(first: str, compared: Sequence[tuple[str, Comparison]]) -> Table:
-    columns = tuple(dict.fromkeys(each for _, of in compared for each in of.differences))
+    known = dict.fromkeys(each for _, of in compared for each in of.differences)
+    columns = tuple(sorted(known, key=lambda column: -sum(column in of.lost for _, of in compared)))
     rows = tuple(
         (name, *(of.differences[each].as_text(".3g") if each in of.differences else "" for each in columns))
         for name, of in compared
@@ -254,16 +257,17 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
         return Comparison(differences, Verdict((), (f"{question} {why or _NO_HALVES}",)))
     better, worse = (
         [
-            names[each]
+            each
             for each, of in differences.items()
             if (of.low > 0 if ours[each].result.higher_is_better is wins else of.high < 0)
         ]
         for wins in (True, False)
     )
     answer = ("In part" if worse else "Yes") if better else ("No" if worse else "Undecided")
-    undecided = tuple(one for one in names.values() if one not in (*worse, *better))
-    tally = Tally(f"{question} {answer}", tuple(worse), tuple(better), undecided)
-    return Comparison(differences, Verdict((tally,), ()))
+    undecided = tuple(name for each, name in names.items() if each not in (*worse, *better))
+    lost, won = (tuple(names[each] for each in some) for some in (worse, better))
+    tally = Tally(f"{question} {answer}", lost, won, undecided)
+    return Comparison(differences, Verdict((tally,), ()), tuple(worse))
 
 
 def _groups_in_common(card: Scorecard, other: Scorecard) -> int:

@@ -37,6 +37,9 @@ class Objective(nn.Module, ABC):
     period: int = 1
     """Number of training steps after which the same operations come again; more than 1 if some terms come rarely."""
 
+    keeps_encodings: bool = False
+    """Whether it keeps what a frozen network makes of each image; images then come with keys (``Example.keys``)."""
+
     def __init__(self, sensor: SensorModel) -> None:
         super().__init__()
         self.sensor = sensor

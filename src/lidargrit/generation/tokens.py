@@ -236,6 +236,7 @@ class TokenObjective(Objective):
     """Base of the objectives of transformers over the tokens of a frozen tokenizer."""
 
     over = ("tokenizer",)
+    keeps_encodings = True
     token_counts: Tensor
 
     def __init__(self, tokenizer: Tokenizer, transformer: Transformer) -> None:
@@ -255,9 +256,9 @@ class TokenObjective(Objective):
         return weights
 
     @torch.no_grad()
-    def encode(self, images: RangeImage) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:
+    def encode(self, example: Example) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T"]]:
         """Return the tokens, and their negative log-likelihood in nats by a model that knows only token frequencies."""
-        tokens = self._tokens(images).long().flatten(1)
+        tokens = self._tokens(example.images, example.keys).long().flatten(1)
         if self.training:
             ones = torch.ones_like(tokens, dtype=self.token_counts.dtype).flatten()
             self.token_counts += sum_over_processes(
@@ -282,6 +283,7 @@ class PixelObjective(Objective):
         self._tokens = None if tokenizer is None else EncodingCache(tokenizer, _tokens)
         self._decoding = None if tokenizer is None else Frozen(tokenizer.for_decoding("fp32"))
         self.over = () if tokenizer is None else ("tokenizer",)
+        self.keeps_encodings = tokenizer is not None
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the nats of the mask a pixel plus those of the range a return as ``loss``, and each of them in bits.
@@ -293,7 +295,9 @@ class PixelObjective(Objective):
         if self._tokens is not None and self._decoding is not None:
             tokenizer = self._decoding.network(images.range_m.device)
             with torch.no_grad(), in_full(images.range_m.device):  # as when scans are sampled
-                decoded = tokenizer.decode(TokenGrid.unchecked(self._tokens(images).long(), tokenizer.num_codes))
+                decoded = tokenizer.decode(
+                    TokenGrid.unchecked(self._tokens(images, example.keys).long(), tokenizer.num_codes)
+                )
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
         else:

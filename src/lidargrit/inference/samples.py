@@ -5,6 +5,7 @@ import os
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
+from functools import lru_cache, partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -23,12 +24,16 @@ from lidargrit.core.files import (
     write_json,
     write_text,
 )
+from lidargrit.core.shares import each_done
 from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, trained_on_file, weights_sha256
 from lidargrit.data.scan_folder import begun_by
 from lidargrit.data.sources.samples import CONDITION, MANIFEST, is_sample_folder, read_condition
-from lidargrit.generation.generator import Generator, SamplingT
+from lidargrit.generation.generator import Generator, SamplingT, load
+from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import NOTHING, Condition, Observed
 from lidargrit.scans.types import RangeImage
+
+_SHARE_ON_RAY = 32  # seeds: two batches, seconds of work
 
 
 def write_samples(
@@ -88,6 +93,35 @@ def write_samples(
     if seeds and (not is_sample_folder(folder) or _missing(folder, seeds)):
         raise removed_meanwhile(folder)
     remove_partials(folder)
+
+
+def write_samples_on_ray(
+    run_folder: Path, folder: Path, seeds: Sequence[int], words: Sequence[str], ray: str, device: str = ""
+) -> None:
+    """Let a Ray cluster write the samples of :func:`write_samples`, on its GPUs where it has some.
+
+    Args:
+        run_folder: folder of the generator, and ``folder`` of the samples: all machines see both at these paths.
+        words: settings of sampling, as ``temperature=1.1``.
+        ray: address of the cluster; see :func:`each_done`.
+        device: device of each task; its GPU, or its CPU where the cluster has none, if not given.
+    """
+    shares = [seeds[first : first + _SHARE_ON_RAY] for first in range(0, len(seeds), _SHARE_ON_RAY)]
+    do = partial(_write_some, run_folder, folder, words, device)
+    with reporting.progress("sampling", len(seeds)) as progress:
+        for count in each_done(do, shares, ray=ray, on_gpus=device != "cpu"):
+            progress.advance(count)
+
+
+def _write_some(run_folder: Path, folder: Path, words: Sequence[str], device: str, seeds: Sequence[int]) -> int:
+    generator = _generator_of(run_folder, device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    write_samples(generator, run_folder, folder, seeds, generator.parse_sampling(words))
+    return len(seeds)
+
+
+@lru_cache(maxsize=1)  # for all shares of a worker
+def _generator_of(run_folder: Path, device: str) -> Generator[Any, Any]:
+    return load(run_folder).to(usable_device(device))
 
 
 def _refuse_other_condition(folder: Path, condition: Condition, there: dict[int, int]) -> None:

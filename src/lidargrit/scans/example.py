@@ -1,6 +1,7 @@
 """One batch of training examples: range images, and what a generator is told of each."""
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -15,18 +16,34 @@ class Example:
     Args:
         images: batch of range images (B, H, W).
         condition: condition of each image, as many as images; or nothing.
+        keys: key of each image, by which what is computed of it is known again; None where nothing is kept.
     """
 
     images: RangeImage
     condition: Condition = NOTHING
+    keys: tuple[bytes, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
 
     def __getitem__(self, index: slice | list[int]) -> "Example":
         """Return some of the examples."""
-        return Example(self.images[index], self.condition[index])
+        keys = self.keys
+        if keys is not None:
+            keys = keys[index] if isinstance(index, slice) else tuple(keys[number] for number in index)
+        return Example(self.images[index], self.condition[index], keys)
 
     def to(self, device: torch.device | str) -> "Example":
         """Return the examples with their tensors on another device."""
-        return Example(self.images.to(device), self.condition.to(device))
+        return Example(self.images.to(device), self.condition.to(device), self.keys)
+
+    def with_keys(self) -> "Example":
+        """Return the examples with the keys of their images; those on a GPU are copied to the host for it."""
+        return replace(self, keys=keys_of(self.images))
+
+
+def keys_of(images: RangeImage) -> tuple[bytes, ...]:
+    """Return a hash of the pixels of each image, so that an augmented image is another."""
+    maps = [images.range_m] if images.reflectance is None else [images.range_m, images.reflectance]
+    each = zip(*(one.cpu().numpy() for one in maps), strict=True)
+    return tuple(hashlib.blake2b(b"".join(part.tobytes() for part in parts), digest_size=16).digest() for parts in each)

@@ -25,6 +25,9 @@ from lidargrit.scans.example import Example
 class Engine:
     """Runs an objective on this machine's device, in one process or in each of several under a launcher.
 
+    Attributes:
+        sees_at_once: whether the host knows numbers as soon as they are computed, as on a CPU, and need not wait.
+
     Args:
         precision: number type of products; ``auto`` is ``bf16`` where the machine has instructions for it.
         reaches_all_weights: whether every loss has a gradient in every weight; otherwise, as in adversarial training,
@@ -57,6 +60,8 @@ class Engine:
         self._fabric: Any = Fabric(precision="bf16-mixed" if short else "32-true", **where)
         self._fabric.launch()
         self.device, self.rank, self.world_size = self._fabric.device, self._fabric.global_rank, self._fabric.world_size
+        self.sees_at_once = self.device.type == "cpu"
+        self._finite = torch.ones((), dtype=torch.bool, device=self.device)
 
     def set_up(self, objective: Objective, optimiser: torch.optim.Optimizer) -> None:
         """Move an objective to the device, and synchronise its gradients over the processes."""
@@ -107,7 +112,8 @@ class Engine:
     def step(self, example: Example, seed: int, gradient_clip: float, parts: int = 1) -> dict[str, Tensor]:
         """Take one step, or one for each player in turn, and return the loss terms, averaged over the processes.
 
-        If a loss or a gradient is not finite in any process, no process changes its weights.
+        On a CPU no process changes its weights if a loss or a gradient is not finite in any of them. Elsewhere the host
+        would have to wait for every step: there :meth:`is_finite` tells it of all steps so far.
 
         Args:
             parts: number of parts of the share whose gradients are computed one after the other and added up.
@@ -132,18 +138,27 @@ class Engine:
             with self._fabric.no_backward_sync(self._objective, enabled=part < parts - 1):
                 found = self._objective(partial(_same, some), derive_seed(seed, part) if part else seed, player)
                 loss = self._mean(found["loss"].detach().clone())
-                if not bool(loss.isfinite()):
+                if not self._goes_on(loss):
                     return {**found, "loss": loss}, False
                 self._fabric.backward(found["loss"] / parts)
             terms = {name: terms.get(name, 0.0) + term.detach() / parts for name, term in found.items()}
         norm = self._fabric.clip_gradients(
             self._objective, self._optimiser, max_norm=gradient_clip or math.inf, error_if_nonfinite=False
         )
-        if not bool(norm.isfinite()):
+        if not self._goes_on(norm):
             return {**terms, "loss": norm}, False
         self._optimiser.step()
         self._optimiser.zero_grad()  # to None: the optimiser leaves alone what the next player does not move
         return self._means(terms), True
+
+    def _goes_on(self, number: Tensor) -> bool:
+        """Note whether a loss or gradient is finite, and return whether the step may go on, for all that is known."""
+        self._finite = self._finite & number.isfinite()
+        return not self.sees_at_once or bool(self._finite)
+
+    def is_finite(self) -> bool:
+        """Return whether all losses and gradients so far were finite; the host waits for the device."""
+        return bool(self._finite)
 
     def _mean(self, number: Tensor) -> Tensor:
         return number if self.world_size == 1 else self._fabric.all_reduce(number, reduce_op="mean")

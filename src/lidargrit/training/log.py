@@ -1,4 +1,4 @@
-"""Loss terms of a stage in training → ``log.jsonl`` and TensorBoard's event files."""
+"""Loss terms of a stage in training → ``log.jsonl``, and TensorBoard's event files where that is installed."""
 
 import json
 from contextlib import suppress
@@ -59,8 +59,10 @@ class Log:
             ) from error
 
     def _plot(self, split: str, scans_seen: int, terms: dict[str, float]) -> None:
-        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  slow to import, and only training needs it
-
+        try:
+            from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  slow to import, and an extra
+        except ImportError:
+            return
         if self._board is None:  # TensorBoard itself removes what was logged from purge_step on
             self._board = SummaryWriter(str(self._path.parent), purge_step=self._resumed_at + 1)
         for name, value in terms.items():

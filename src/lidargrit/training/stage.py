@@ -142,23 +142,28 @@ class StageTraining:
             self.engine.world_size,
             self.workers,
             self.condition.of,
+            self.objective.keeps_encodings,
         )
         begun = time.monotonic()
         progress_bar = reporting.progress(what, config.scans, self.scans_seen)
         with Termination(self.deadline_s) as termination, progress_bar as progress:
             if self.engine.any(self._lacks_validation) and self._validates():  # the process ended before it
                 self._log_terms("val", self.validate(val, termination), 0.0)
+            note = ""
             for example in batches.stream(self.scans_seen, config.scans):
                 terms = self._step(example)
                 stops = self.engine.any(termination.asked)
-                progress.advance(
-                    config.batch_size, f"loss {float(terms['loss']):.4f}  {self.engine.peak_gib():.1f} GiB"
-                )
-                if self._passed(_LOG_EVERY_STEPS * config.batch_size):
+                logs = self._passed(_LOG_EVERY_STEPS * config.batch_size)
+                saves = self._passed(config.checkpoint_every) or self._validates() or stops
+                if logs or saves or self.engine.sees_at_once:  # else the host would wait for a GPU in every step
+                    self._check_finite(terms)
+                    note = f"loss {float(terms['loss']):.4f}  {self.engine.peak_gib():.1f} GiB"
+                progress.advance(config.batch_size, note)
+                if logs:
                     self._log_terms(
                         "train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun
                     )
-                if self._passed(config.checkpoint_every) or self._validates() or stops:
+                if saves:
                     self._save()  # before anything that may fail, or take longer than a terminated process has
                 if stops:
                     raise Terminated
@@ -199,16 +204,21 @@ class StageTraining:
         seed = derive_seed(self.seed, 2, self.scans_seen, self.engine.rank)
         torch.manual_seed(derive_seed(seed, 0, 1))  # of dropout, which takes the global random numbers
         terms = self.engine.step(example.to(self.engine.device), seed, config.gradient_clip, config.accumulate)
-        if not bool(terms["loss"].isfinite()):
-            raise TrainingError(
-                f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",
-                "finite numbers",
-                "use a new folder and a lower training.*.learning_rate"
-                + (f"; the last checkpoint is {self.checkpoint}" if self.checkpoint.exists() else ""),
-            )
+        if self.engine.sees_at_once:
+            self._check_finite(terms)
         self.scans_seen += config.batch_size
         self.average.update(self.objective, self.scans_seen, config.batch_size)
         return terms
+
+    def _check_finite(self, terms: dict[str, Tensor]) -> None:
+        if self.engine.is_finite():
+            return
+        raise TrainingError(
+            f"a loss or gradient of {float(terms['loss'].detach())} after {self.scans_seen} scans",
+            "finite numbers",
+            "use a new folder and a lower training.*.learning_rate"
+            + (f"; the last checkpoint is {self.checkpoint}" if self.checkpoint.exists() else ""),
+        )
 
     def _begin(self) -> None:
         remove_partials(self.checkpoint.parent)

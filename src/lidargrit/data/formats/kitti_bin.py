@@ -8,7 +8,7 @@ import torch
 
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, wide_row, write_rows
+from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, whole_rows, wide_row, write_rows
 from lidargrit.data.formats.shared.carla import right_handed
 from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
@@ -51,15 +51,8 @@ class KittiBin(ScanFormat):
             nuscenes = "if nuScenes wrote it, name it .pcd.bin; else " if width == 5 else ""
             cure = f"{nuscenes}keep x, y, z and reflectance from 0 to 1, or save named columns as .npz"
             raise ScanError(f"rows of {width} numbers in {path}", _FORMAT, cure)
-        if len(data) % _ROW_BYTES:
-            nuscenes = len(data) % 20 == 0
-            raise ScanError(
-                f"{len(data)} bytes in {path}, {len(data) % _ROW_BYTES} more than whole points",
-                _FORMAT,
-                ("if its rows have 5 columns, as nuScenes writes them, name it .pcd.bin; else " if nuscenes else "")
-                + "download it again: the file was cut short or is of another format",
-            )
-        rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 4))
+        nuscenes = "if its rows have 5 columns, as nuScenes writes them, name it .pcd.bin; else "
+        rows = whole_rows(data, path, len(_COLUMNS), _FORMAT, nuscenes if len(data) % 20 == 0 else "")
         scan = scan_of(
             rows[:, :3],
             rows[:, 3].contiguous(),

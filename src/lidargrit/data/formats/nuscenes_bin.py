@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, write_rows
+from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, whole_rows, write_rows
 from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
 
@@ -52,15 +52,8 @@ class NuscenesBin(ScanFormat):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
         data = read_bytes(path, POINTS_AT_MOST * _ROW_BYTES, _FORMAT)
-        if len(data) % _ROW_BYTES:
-            raise ScanError(
-                f"{len(data)} bytes in {path}, {len(data) % _ROW_BYTES} more than whole points",
-                _FORMAT,
-                "if its rows are x, y, z, reflectance, as KITTI writes them, name it .bin"
-                if len(data) % 16 == 0
-                else "download it again: the file was cut short or is of another format",
-            )
-        rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 5))
+        kitti = "if its rows are x, y, z, reflectance, as KITTI writes them, name it .bin; else "
+        rows = whole_rows(data, path, len(_COLUMNS), _FORMAT, kitti if len(data) % 16 == 0 else "")
         if not _are_lasers(rows[:, 4].numpy()):
             raise ScanError(f"laser numbers other than 0 to 31 in {path}", _FORMAT, "check the layout of its rows")
         marks = read_marks(path, len(rows))

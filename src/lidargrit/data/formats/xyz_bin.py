@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import columns_by_name, row_width, rows_of, write_rows
+from lidargrit.data.formats.shared.bare_rows import columns_by_name, row_width, rows_of, whole_rows, write_rows
 from lidargrit.data.formats.shared.filled import marks_file, read_marks
 from lidargrit.scans.types import Scan
 
@@ -45,13 +44,7 @@ class XyzBin(ScanFormat):
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
         data = read_bytes(path, POINTS_AT_MOST * _ROW_BYTES, _FORMAT)
-        if len(data) % _ROW_BYTES:
-            raise ScanError(
-                f"{len(data)} bytes in {path}, {len(data) % _ROW_BYTES} more than whole points",
-                _FORMAT,
-                "download it again: the file was cut short or is of another format",
-            )
-        rows = torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, 3))
+        rows = whole_rows(data, path, len(_COLUMNS), _FORMAT)
         farthest_m = float(rows.nan_to_num(0.0, 0.0, 0.0).abs().max())
         if farthest_m > _FARTHEST_M:
             raise ScanError(f"a coordinate of {farthest_m:g} m in {path}", _FORMAT, "check the layout of its rows")

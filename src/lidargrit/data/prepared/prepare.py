@@ -37,6 +37,7 @@ def prepare(
     rank: int | None = None,
     world_size: int | None = None,
     dataset: ScanDataset | None = None,
+    ray: str = "",
 ) -> Path:
     """Project every scan of a source into a folder of shards; shards that are there already are kept.
 
@@ -48,6 +49,7 @@ def prepare(
             are there. If not given, the environment's ``RANK``, else 0.
         world_size: number of machines that share the work; if not given, the environment's ``WORLD_SIZE``, else 1.
         dataset: data set of the source, where it is open already.
+        ray: address of a Ray cluster that projects in place of processes; see :func:`each_done`.
 
     Returns:
         the folder, complete.
@@ -67,7 +69,7 @@ def prepare(
             if not (folder / PLAN_FILE).exists():  # another machine has failed meanwhile, and taken its plan back
                 _claim(folder, spec, scans)
             first = len(missing) * rank // world_size
-            make_shards(folder, spec, missing[first:] + missing[:first], dataset, config.workers)
+            make_shards(folder, spec, missing[first:] + missing[:first], dataset, config.workers, ray)
     except BaseException:
         _take_back(folder)
         raise
@@ -117,23 +119,24 @@ def prepare_and_describe(
     rank: int | None = None,
     world_size: int | None = None,
     verify: bool = False,
+    ray: str = "",
 ) -> Prepared:
     """Prepare a source and return what the folder holds.
 
     Args:
-        source, dataset, config, folder, rank, world_size: the arguments of :func:`prepare`.
+        source, dataset, config, folder, rank, world_size, ray: the arguments of :func:`prepare`.
         verify: whether to read every image back and make damaged shards again.
     """
     begun = time.monotonic()
     imaging = choose_imaging(source, dataset, config.load_sensor(), config)
     imaging.report()
     config, sensor = imaging.config, imaging.sensor
-    folder = prepare(source, config, folder, sensor, rank, world_size, dataset)
+    folder = prepare(source, config, folder, sensor, rank, world_size, dataset, ray)
     if verify and (damaged := damaged_shards(folder, rank, world_size)):
         reporting.message(f"damaged and made again: shards {', '.join(map(str, damaged))}")
         for shard in damaged:
             (folder / made_name(shard)).unlink(missing_ok=True)  # another process may have removed it
-        prepare(source, config, folder, sensor, rank, world_size, dataset)
+        prepare(source, config, folder, sensor, rank, world_size, dataset, ray)
     images, seconds = PreparedImages(str(folder)), time.monotonic() - begun
     for remark in images.remarks():
         reporting.message(remark)

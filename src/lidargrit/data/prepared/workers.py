@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import DataError, HeldError, LidarGritError, OutputError, ScanError
 from lidargrit.core.files import claim_folder, write_json
 from lidargrit.core.processes import module_command
+from lidargrit.core.shares import each_done
 from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.arrays import ImageArrays, facts_of, stored
 from lidargrit.data.prepared.plan import ARRAYS, PLANES, MadeScans, PreparedSpec, made_name, pixels_name
@@ -35,15 +36,22 @@ _WAIT_S = 0.5  # before looking again whether a shard is there that another proc
 _KEEP_EVERY_S = 5.0  # what a killed process loses at most; a shard of real scans takes about as long
 
 
-def make_shards(folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int) -> None:
+def make_shards(
+    folder: Path, spec: PreparedSpec, shards: list[int], dataset: ScanDataset, workers: int, ray: str = ""
+) -> None:
     """Make shards, in this process if one is enough, else in several; shards that another machine makes are waited for.
 
     Args:
         shards: numbers of the shards that are missing, in the order in which this machine takes them.
+        ray: address of a Ray cluster that makes them, a task each.
     """
     total = sum(len(spec.scans_of(shard)) for shard in shards)
     workers = min(workers, len(shards))
     with reporting.progress("projecting scans", spec.num_scans, spec.num_scans - total) as progress:
+        if ray:
+            for count in each_done(partial(_make_one, folder), shards, ray=ray):
+                progress.advance(count)
+            return
         if workers <= 1:
             _make_free_shards(folder, spec, shards, dataset, progress.advance)
             return
@@ -72,6 +80,18 @@ def _make_free_shards(
                     make_shard(folder, spec, shard, dataset, advance)
                 is_waiting = False
         time.sleep(_WAIT_S if is_waiting else 0)
+
+
+def _make_one(folder: Path, shard: int) -> int:
+    """Make one shard of a folder by its plan, unless it is there, and return the number of its scans."""
+    spec = PreparedFolder(str(folder)).read_spec()
+    _make_free_shards(folder, spec, [shard], _dataset_of(spec.source, spec.bad_points), lambda _: None)
+    return len(spec.scans_of(shard))
+
+
+@lru_cache(maxsize=1)  # for all shards that a worker makes: a data set may have a million files
+def _dataset_of(source: str, bad_points: str) -> ScanDataset:
+    return open_dataset(source, "drop" if bad_points == "drop" else "refuse")
 
 
 def make_shard(
@@ -223,7 +243,7 @@ def make_some_shards(folder: Path, parent: int, shards: list[int]) -> int:
     """Make shards until the parent process ends; print a line for every scan, or the error."""
     try:
         spec = PreparedFolder(str(folder)).read_spec()
-        dataset = open_dataset(spec.source, "drop" if spec.bad_points == "drop" else "refuse")
+        dataset = _dataset_of(spec.source, spec.bad_points)
         told = partial(print, flush=True)
         _make_free_shards(folder, spec, shards, dataset, told, lambda: os.getppid() == parent)
     except LidarGritError as error:

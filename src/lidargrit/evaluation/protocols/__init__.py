@@ -1,11 +1,10 @@
 """The name of a protocol → the metrics that it asks for, and the images on which it computes them."""
 
-import hashlib
-import json
 from dataclasses import asdict, dataclass, replace
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import UnknownNameError, one_of
+from lidargrit.core.files import sha256_of_json
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
@@ -64,7 +63,7 @@ class Protocol:
     def sha256(self) -> str:
         """Hash of all that a protocol fixes, without what it says of itself."""
         told = {"title": "", "source": "", "departures": ()}
-        return hashlib.sha256(json.dumps(asdict(replace(self, **told))).encode()).hexdigest()
+        return sha256_of_json(asdict(replace(self, **told)))
 
     def scans_at_most(self, wanted: int = 0) -> int:
         """Return the largest number of scans of each set; 0 for as many as there are.

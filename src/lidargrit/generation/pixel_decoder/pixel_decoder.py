@@ -14,7 +14,14 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Temperature, Weight
 from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig
-from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
+from lidargrit.generation.pixel_decoder.pixel_phases import (
+    Lattice,
+    Phase,
+    at_phases,
+    join_phases,
+    of_host,
+    one_of_phases,
+)
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
@@ -169,7 +176,7 @@ class PixelDecoder(nn.Module):
         guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
-        returns = guide.v.new_zeros(())
+        returns, rng = guide.v.new_zeros(()), of_host(rng)
         for phases in self.mask.by_lattice():
             chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
             of_mask, of_range = self._nll(chosen, guided, guide, images)

@@ -20,6 +20,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     at_phases,
     cells_of,
     generated_before,
+    of_host,
     one_of_phases,
     phases_of,
 )
@@ -349,6 +350,7 @@ class MaskNetwork(PhaseNetwork):
             rng: chooses one phase of each lattice, which stands for all; every phase is counted without it.
         """
         guided, total = self.guided(guide), guide.v.new_zeros(len(returned))
+        rng = None if rng is None else of_host(rng)
         for phases in self.by_lattice():
             chosen = phases if rng is None else one_of_phases(phases, rng)
             nll = self.phase_nll(chosen, guided, guide, returned)

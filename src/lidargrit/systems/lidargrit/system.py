@@ -231,8 +231,7 @@ class NextToken(TokenObjective):
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
-        images = example.images
-        tokens, unigram_nll = self.encode(images)
+        tokens, unigram_nll = self.encode(example)
         logits = self.transformer(after_start(tokens[:, :-1]))
         loss = F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten())
         return {"loss": loss, "unigram_nll": unigram_nll.mean()}

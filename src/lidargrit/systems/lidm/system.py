@@ -240,8 +240,10 @@ class LatentDenoising(Objective):
     """The objective: the squared error of the predicted noise in the latents of a frozen tokenizer, at random steps."""
 
     over = ("tokenizer",)
+    keeps_encodings = True
     settings = ("scale_latents", "latent_axes")
     latent_scale: Tensor
+    _shares: Tensor
 
     def __init__(
         self,
@@ -254,17 +256,17 @@ class LatentDenoising(Objective):
         super().__init__(tokenizer.sensor)
         self.denoiser = denoiser
         self._latents = EncodingCache(tokenizer, _latents)
-        self._shares, self.axes = shares, axes
+        self.axes = axes
+        self.register_buffer("_shares", shares, persistent=False)
         self.register_buffer("latent_scale", latent_scale.clone())
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the mean squared error as ``loss``, and the standard deviation of the scaled latents beside it."""
-        images = example.images
-        latents = self._latents(images)
+        latents = self._latents(example.images, example.keys)
         clean = latents / self.latent_scale if self.axes is None else self.axes(latents)
         step = torch.randint(latent_diffusion.TIME_STEPS, (len(clean),), generator=rng, device=clean.device)
         noise = torch.randn(clean.shape, generator=rng, device=clean.device)
-        noisy = latent_diffusion.noised(clean, self._shares.to(clean.device)[step], noise)
+        noisy = latent_diffusion.noised(clean, self._shares[step], noise)
         error = (self.denoiser(noisy, step.float()).float() - noise).square().mean()
         return {"loss": error, "latent_std": clean.std()}
 

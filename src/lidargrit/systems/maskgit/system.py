@@ -119,8 +119,7 @@ class HiddenTokens(TokenObjective):
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return the paper's eq. 1 per hidden token, and the same of a model that knows only token frequencies."""
-        images = example.images
-        tokens, unigram_nll = self.encode(images)
+        tokens, unigram_nll = self.encode(example)
         count, length = tokens.shape
         # Each scan's progress is uniform in [0, 1); within a batch they are evenly spread, which calms the loss.
         progress = (

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float32, Shaped
 from torch import Tensor
 
+from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats.shared.filled import write_marks
 from lidargrit.scans.file_rows import FileRows
@@ -37,6 +38,26 @@ def wide_row(values: Float32[np.ndarray, "n"]) -> int:
     """Return how many numbers make a point if they are more than four; 0 if not, or if too few tell."""
     width = row_width(values) if len(values) >= _FEW_NUMBERS else 0
     return width if width > 4 else 0
+
+
+def whole_rows(data: bytes, path: Path, width: int, layout: str, cure: str = "") -> Float32[Tensor, "n w"]:
+    """Return the numbers of a file as rows of a point each.
+
+    Args:
+        width: numbers of a point.
+        layout: rows that were wanted, in words, for an error.
+        cure: beginning of the sentence on what helps, before a new download; "" if nothing else does.
+
+    Raises:
+        ScanError: the last row is not whole.
+    """
+    if over := len(data) % (4 * width):
+        raise ScanError(
+            f"{len(data)} bytes in {path}, {over} more than whole points",
+            layout,
+            f"{cure}download it again: the file was cut short or is of another format",
+        )
+    return torch.from_numpy(np.frombuffer(bytearray(data), dtype="<f4").reshape(-1, width))
 
 
 def columns_by_name(

@@ -1,4 +1,4 @@
-"""R2DM and R2Flow: (5, 64, 1024) tensors of range in metres, x, y, z and reflectance → metres and reflectance."""
+"""R2DM, R2Flow, LiDARCrafter: (5, rows, 1024) tensors of range, x, y, z in metres and reflectance → these two."""
 
 from torch import Tensor
 
@@ -12,10 +12,14 @@ def decode(scan: Tensor) -> Decoded:
 
 
 r2dm = SampleFormat(
-    title="R2DM's sample_and_save.py",
-    source="kazuto1011/r2dm@004a1e4: sample_and_save.py, utils/lidar.py",
+    title="R2DM's sample_and_save.py, and LiDARCrafter's sample_and_save_cond.py",
+    source="kazuto1011/r2dm@004a1e4: sample_and_save.py, utils/lidar.py; worldbench/lidarcrafter@3c62da2: "
+    "tools/evaluation/sample_and_save_cond.py",
     channels=5,
-    sensors=(("hdl64e_kitti_360", 0, 1),),  # by elevation, its default; its images by ring look the same
+    sensors=(
+        ("hdl64e_kitti_360", 0, 1),
+        ("hdl32e_nuscenes", 0, 1),
+    ),  # by elevation, its default; its images by ring look the same
     variant="exact",
     decode=decode,
 )

@@ -1,0 +1,97 @@
+"""nuScenes at 32x1024: the published protocol against a loop over points, and the fair one, a row for each laser."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import lidargrit
+from lidargrit.data.sources.sample_formats import load_sample_format, read_tensor_folder
+from lidargrit.evaluation.protocols import load_protocol
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.types import Scan
+
+ROWS, COLUMNS, AZIMUTHS = 32, 1024, 200
+LASERS_DEG = [32 / 3 - 4 / 3 * laser for laser in range(ROWS)]
+
+
+def street(seed, tilt_deg=0.0):
+    """A scan of an HDL-32E: (n, 3) points laser by laser, and the laser of each."""
+    rng = np.random.default_rng(seed)
+    range_m = rng.uniform(2, 75, (ROWS, AZIMUTHS))
+    elevation = np.radians(LASERS_DEG)[:, None] + math.radians(tilt_deg)
+    azimuth = np.linspace(-math.pi, math.pi, AZIMUTHS, endpoint=False)[None] + 1e-3
+    flat = range_m * np.cos(elevation)
+    xyz = np.stack((flat * np.cos(azimuth), flat * np.sin(azimuth), range_m * np.sin(elevation)), axis=-1)
+    return xyz.reshape(-1, 3).astype(np.float32), np.repeat(np.arange(ROWS), AZIMUTHS)
+
+
+def pixels_of_the_program(xyz):
+    """Nearest range of each pixel, by the formulas of load_points_as_images; points outside the field are left out."""
+    found = {}
+    for x, y, z in xyz.astype(np.float64):
+        range_m = math.sqrt(x * x + y * y + z * z)
+        row = math.floor((1 - (math.asin(z / range_m) + math.radians(30)) / math.radians(40)) * ROWS)
+        column = math.floor(((-math.atan2(y, x) / math.pi + 1) / 2 % 1) * COLUMNS)
+        if 0 <= row < ROWS and 1.45 <= range_m <= 80:
+            found[row, column] = min(range_m, found.get((row, column), math.inf))
+    return found
+
+
+def cells(pixels):
+    """Counts of the protocol's bird's-eye view: 100x100 cells of 1.6 m, points 3 to 70 m and returns within 63 m."""
+    counts = np.zeros((100, 100))
+    for (row, column), range_m in pixels.items():
+        elevation, azimuth = math.radians(10 - 1.25 * (row + 0.5)), math.pi - 2 * math.pi * (column + 0.5) / COLUMNS
+        if 3 < range_m < 63:
+            flat = range_m * math.cos(elevation)
+            at = [math.floor((flat * turn(azimuth) + 80) / 1.6) for turn in (math.cos, math.sin)]
+            counts[at[0], at[1]] += 1
+    return counts
+
+
+def divergence_root(first, second):
+    p, q = first.ravel() / first.sum(), second.ravel() / second.sum()
+    total = 0.0
+    for a, b in zip(p, q, strict=True):
+        total += sum(x * math.log(2 * x / (a + b)) / 2 for x in (a, b) if x > 0)
+    return math.sqrt(total)
+
+
+def test_the_published_protocol_against_a_loop_over_points():
+    clouds = [street(seed, -0.05)[0] for seed in range(4)]
+    pixels = [pixels_of_the_program(cloud) for cloud in clouds]
+    assert {row for one in pixels for row, _ in one} == set(range(ROWS)) - {7, 23}, "lasers at 0 and -20 degrees"
+    raised = pixels_of_the_program(street(0, 0.05)[0])
+    assert {row for row, _ in raised} == set(range(ROWS)) - {8, 24}, "the same, a little higher"
+    sensor = load_sensor("hdl32e_nuscenes")
+    image = lidargrit.project(clouds[0], sensor)
+    ours = {(int(row), int(column)): float(image.range_m[row, column]) for row, column in image.return_mask.nonzero()}
+    assert ours == pytest.approx(pixels[0], rel=1e-6)
+    sums = [sum(map(cells, some)) for some in (pixels[:2], pixels[2:])]
+    card = lidargrit.evaluate(clouds[:2], clouds[2:], "lidarcrafter", ["bev_jsd"], sensor=sensor)
+    assert card.scores[0].result.value == pytest.approx(divergence_root(*sums), rel=1e-6)
+    assert any(
+        "compares with scans of the training split" in fault for fault in load_protocol("lidarcrafter").departures
+    )
+
+
+def test_the_fair_protocol_has_a_row_for_each_laser():
+    xyz, laser = street(0)
+    sensor = load_protocol("fair-nuscenes").load_sensor()
+    assert sensor is not None
+    assert (sensor.height, sensor.width, sensor.projection) == (ROWS, COLUMNS, "unfolding")
+    image = lidargrit.project(Scan(torch.from_numpy(xyz), ring=torch.from_numpy(laser)), sensor)
+    assert image.return_mask.sum(dim=1).tolist() == [AZIMUTHS] * ROWS
+    np.testing.assert_allclose(np.degrees(sensor.elevation_rad[:, 0].numpy()), LASERS_DEG, atol=1e-4)
+
+
+def test_samples_of_lidarcrafter_are_read(tmp_path):
+    written = torch.rand(5, ROWS, COLUMNS) * 50
+    written[4] /= 50
+    torch.save(written, tmp_path / "samples_0000000_token.pth")
+    images = read_tensor_folder(tmp_path)
+    assert images.sensor.name == "hdl32e_nuscenes"
+    assert torch.equal(images.batch([0]).range_m[0], written[0])
+    assert "LiDARCrafter" in load_sample_format("r2dm").title
