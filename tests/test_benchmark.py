@@ -1,6 +1,7 @@
 """Several systems trained, sampled and scored alike, to one table; equal compute; the arithmetic counted by hand."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -37,6 +38,14 @@ NARROW = ("model.unet.channels=8", "model.unet.channel_multipliers=[1,1,1,1]", "
 BENCHMARK = Benchmark("simulated:8:test", 8, QUICK, (*FEW, "seed=3"))
 
 
+@pytest.fixture(scope="module")
+def one_system(tmp_path_factory):
+    """Return the folder of a comparison of one system, which tests copy before they go on with it."""
+    folder = tmp_path_factory.mktemp("comparison")
+    run_benchmark(["marginal"], folder, BENCHMARK)
+    return folder
+
+
 def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     systems = ["marginal", "memorised"]
     scores = run_benchmark(systems, tmp_path, BENCHMARK)
@@ -56,9 +65,8 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     )
 
 
-def test_a_run_named_by_dots_has_the_name_of_its_folder(tmp_path, monkeypatch):
-    finished = tmp_path / "first" / "runs" / "marginal"
-    run_benchmark(["marginal"], tmp_path / "first", BENCHMARK)
+def test_a_run_named_by_dots_has_the_name_of_its_folder(one_system, tmp_path, monkeypatch):
+    finished = shutil.copytree(one_system / "runs" / "marginal", tmp_path / "marginal")
     wanted = replace(BENCHMARK, preset_settings=())
     for here, name in ((finished, "."), (finished / "below", "..")):
         here.mkdir(exist_ok=True)
@@ -221,15 +229,14 @@ def test_a_budget_counts_what_is_prepared_once(monkeypatch):
         assert 100 * scans + 900 * min(scans, 50) == pytest.approx(budget, rel=0.021)
 
 
-def test_a_run_of_another_preset_is_not_taken_for_this_one(tmp_path):
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+def test_a_run_of_another_preset_is_not_taken_for_this_one(one_system):
     other = replace(BENCHMARK, preset_settings=("data.train=simulated:5:train", *BENCHMARK.preset_settings[1:]))
     with pytest.raises(LidarGritError, match="which holds another run"):
-        run_benchmark(["marginal"], tmp_path, other)
+        run_benchmark(["marginal"], one_system, other)
 
 
-def test_as_many_are_scored_as_were_asked_for(tmp_path):
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+def test_as_many_are_scored_as_were_asked_for(one_system, tmp_path):
+    shutil.copytree(one_system, tmp_path, dirs_exist_ok=True)
     fewer = run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, num_samples=4))
     assert json.loads(fewer[0].read_text())["inputs"]["samples"]["scans_used"] == 4
 

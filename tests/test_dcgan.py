@@ -163,7 +163,7 @@ def test_a_synthesis_wraps_around_the_circle():
     [
         ({"G": {}}, "which holds no 'G_ema'"),
         ({"G_ema": {"0.0.module.weight": torch.zeros(3)}}, "whose 'G_ema' is no generator of DUSty v1"),
-        ({"G_ema": published(1)}, r"of another configuration \('project.weight'"),  # of smaller images
+        ({"G_ema": published(1)}, r"of another configuration \(of another size 'project.weight'"),  # of smaller images
         ({"G_ema": {**published(1, (64, 256)), "more": torch.zeros(1)}}, "has besides 'more'"),
         ({"G_ema": {"a": torch.zeros(1, dtype=torch.float64)}}, "no float32 tensor"),
         ({"G_ema": [1, 2]}, "which holds no tensors by name"),

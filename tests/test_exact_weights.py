@@ -49,6 +49,18 @@ def test_numbers_of_another_kind_and_parameters_that_are_none_are_refused(name, 
     assert torch.equal(loaded.weight, torch.ones(2)), "the module stays as it was"
 
 
+def test_all_that_differs_in_names_and_sizes_is_counted():
+    weights = {f"new{number}": torch.ones(1) for number in range(5)} | {"bias": torch.ones(3, 2)}
+    with pytest.raises(CheckpointError) as refused:
+        load_exactly(module(), weights, FILE)
+    assert refused.value.got == (
+        "weights in model.safetensors of another configuration (the file lacks 'known', 'num_batches_tracked', "
+        "'running_mean' and 3 more; the file has besides 'new0', 'new1', 'new2' and 2 more; of another size 'bias' 3x2 "
+        "in place of 2)"
+    )
+    assert refused.value.wanted == "the 7 of this model"
+
+
 def test_other_sizes_of_the_same_kind_and_buffers_that_were_never_fitted_are_loaded():
     weights = {**module().state_dict(), "weight": torch.full((2,), 0.5, dtype=torch.float16)}
     loaded = module()

@@ -49,7 +49,7 @@ def test_a_checkpoint_of_the_program_becomes_a_run(cls, preset, tmp_path):
         (
             LidarGan,
             lambda c: c.update({"main.0.weight": torch.ones(5, 16, 2, 32)}),
-            r"'main\.0\.weight' is \(5, 16, 2, 32\)",
+            r"'main\.0\.weight' 5x16x2x32 in place of 5x16x2x16",
         ),
         (LidarGan, lambda c: c.pop("main.1.bias"), r"lacks 'main\.1\.bias'"),
         (LidarVae, lambda c: c.pop("encode.main.0.weight"), "holds no autoencoder"),

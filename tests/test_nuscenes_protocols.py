@@ -7,7 +7,11 @@ import pytest
 import torch
 
 import lidargrit
+from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.sample_formats import load_sample_format, read_tensor_folder
+from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.pairs import grid_of_points_m
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
@@ -95,3 +99,20 @@ def test_samples_of_lidarcrafter_are_read(tmp_path):
     assert images.sensor.name == "hdl32e_nuscenes"
     assert torch.equal(images.batch([0]).range_m[0], written[0])
     assert "LiDARCrafter" in load_sample_format("r2dm").title
+
+
+def test_centres_of_voxels_are_told_beside_the_score(tmp_path):
+    cloud = street(1)[0]
+    voxels = np.unique((np.floor(cloud / 0.2) + 0.5).astype(np.float32) * np.float32(0.2), axis=0)
+    assert grid_of_points_m(torch.from_numpy(voxels)) == pytest.approx(0.2)
+    assert grid_of_points_m(torch.from_numpy(cloud)) == 0
+    assert grid_of_points_m(torch.from_numpy(cloud.round(3))) == 0, "text with millimetres"
+    for name, points in (("voxels", voxels), ("clouds", cloud)):
+        (tmp_path / name).mkdir()
+        for number in range(2):
+            np.savez(tmp_path / name / f"{number}.npz", points)
+    settings = EvalConfig("lidarcrafter", ("bev_jsd",), resampling=Resampling(halves=0), data=DataConfig(workers=1))
+    told = compare_sources(str(tmp_path / "voxels"), str(tmp_path / "clouds"), settings)[0].warnings
+    assert sum("lie on a grid of 0.2 m: centres of voxels" in warning for warning in told) == 1
+    same = compare_sources(str(tmp_path / "clouds"), str(tmp_path / "clouds"), settings)[0].warnings
+    assert not any("voxels, not" in warning for warning in same)

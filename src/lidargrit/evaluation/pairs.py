@@ -5,6 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from jaxtyping import Float
+from torch import Tensor
+
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import Provenance, RangeImages
@@ -16,6 +19,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
 _BATCH = 16
+_POINTS_OF_A_GRID, _SAME_M, _GRID_M = 1000, 1e-3, 0.03  # voxels of generators are 10 to 20 cm wide
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +156,11 @@ def paired(
     require_same_rays(first.images.sensor, reference.images.sensor)
     pair = EvalPair(first.as_set(len(reference), protocol.range_m), reference)
     warnings = (*_warnings(pair), *first.doubts, *doubts)
+    if samples.has_points and (size_m := grid_of_points_m(samples.scans().scan(0).points_xyz_m)):
+        centres = (
+            f"the points of {samples.text} lie on a grid of {size_m:g} m: centres of voxels, not returns of rays; "
+        )
+        warnings = (*warnings, f"{centres}scores of edges, walls, rows and raydrop measure the grid")
     shared = overlap(samples, first.images, provenance)
     leak = f"{samples.text} and the reference overlap ({shared}): the scores flatter it" if shared else ""
     if reference.data_set == "samples" != samples.data_set:
@@ -252,3 +261,16 @@ def require_same_rays(generated: SensorModel, reference: SensorModel) -> None:
             f"the rays of {reference.name!r} ({reference.height}x{reference.width})",
             "project the scans with the samples' sensor: give the samples first, the scans second",
         )
+
+
+def grid_of_points_m(points_xyz_m: Float[Tensor, "n 3"]) -> float:
+    """Return the spacing of the grid that points lie on, as centres of voxels do; 0 for points of rays.
+
+    It is the smallest distance of two coordinates along any axis that differ by more than a millimetre, if that is 3 cm
+    or more; real clouds of a thousand points have neighbours of millimetres along each axis.
+    """
+    if len(points_xyz_m) < _POINTS_OF_A_GRID:
+        return 0.0
+    steps_m = [axis_m.unique().diff() for axis_m in points_xyz_m.double().T]
+    smallest_m = min(float(steps[steps > _SAME_M].min()) if (steps > _SAME_M).any() else 0.0 for steps in steps_m)
+    return round(smallest_m, 3) if smallest_m >= _GRID_M else 0.0
