@@ -2,17 +2,14 @@
 
 import functools
 import json
-import math
 import os
 import re
 import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import CheckpointError, ConfigError, OutputError, TrainingError
@@ -213,59 +210,6 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     assert "checkpoint" not in str(error.value), "there is none yet"
 
 
-class MeanRange(Objective):
-    """A number that learns the mean range, whose loss is not finite from some step on; notes the reads so far."""
-
-    def __init__(self, sensor, reads, breaks_at=10**9):
-        super().__init__(sensor)
-        self.mean = torch.nn.Parameter(torch.tensor(1.0))
-        self.reads, self.breaks_at, self.reads_before = reads, breaks_at, []
-
-    def forward(self, example, rng, player=""):
-        self.reads_before.append(self.reads.count)
-        loss = (example.images.range_m.mean() - self.mean).square()
-        return {"loss": loss * math.nan if len(self.reads_before) > self.breaks_at else loss}
-
-
-class Reads(TorchDispatchMode):
-    """Counts where a number of a tensor is asked for, which waits for a GPU; whole numbers are those of the order."""
-
-    count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func is torch.ops.aten._local_scalar_dense.default and args[0].dtype != torch.long
-        return func(*args, **(kwargs or {}))
-
-    def __deepcopy__(self, memo):
-        return self
-
-
-def mean_range_on_a_gpu(folder, images, breaks_at=10**9):
-    """Return an objective and its training of 50 steps, in which numbers are not seen at once, as on a GPU."""
-    objective = MeanRange(images.sensor, Reads(), breaks_at)
-    config = TrainingConfig(scans=100, batch_size=2, learning_rate=1e-3, checkpoint_every=60)
-    fit = StageTraining(objective, config, folder, 0).begun()
-    fit.engine.sees_at_once = False
-    return objective, fit
-
-
-def test_on_a_gpu_the_host_waits_for_every_twentieth_step_and_for_checkpoints(tmp_path, images):
-    objective, fit = mean_range_on_a_gpu(tmp_path, images)
-    with objective.reads:
-        fit.run(images, images, "training")
-    waits = [step for step, count in enumerate(np.diff(objective.reads_before[:50]), start=1) if count]
-    assert waits == [20, 30, 40]
-    assert [entry["scans_seen"] for entry in read_log(tmp_path / "log.jsonl") if entry["split"] == "train"] == [40, 80]
-
-
-def test_on_a_gpu_no_checkpoint_holds_numbers_that_are_not_finite(tmp_path, images):
-    objective, fit = mean_range_on_a_gpu(tmp_path, images, breaks_at=32)
-    with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 80 scans.*last checkpoint is"):
-        fit.run(images, images, "training")
-    assert len(objective.reads_before) == 40
-    assert all(bool(tensor.isfinite().all()) for tensor in read_tensors(fit.checkpoint)[0].values())
-
-
 @pytest.mark.shared
 @pytest.mark.timeout(600)  # half a minute on a quiet core, minutes on a busy one
 def test_one_real_scan_is_learned_by_heart(tmp_path, real):
@@ -417,8 +361,7 @@ def test_tensorboard_draws_what_the_log_says(tmp_path):
 
 def test_the_log_is_written_without_tensorboard(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    log = Log(tmp_path, 0)
-    log.write("train", 4, 1.0, {"loss": 0.5})
+    (log := Log(tmp_path, 0)).write("train", 4, 1.0, {"loss": 0.5})
     log.close()
     assert [path.name for path in tmp_path.iterdir()] == ["log.jsonl"]
 
