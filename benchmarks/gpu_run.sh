@@ -1,8 +1,10 @@
 #!/usr/bin/env bash
-# One leg of the relay on a bare machine: install, smoke test, train, pack. See docs/how-to/gpu-minutes.md.
+# One leg of the relay on a bare machine: install, smoke test, in the first leg tables of speed, train, pack.
+# See docs/how-to/gpu-minutes.md.
 #   bash benchmarks/gpu_run.sh            from the root of a checkout with wheels/ (benchmarks/gpu_wheels.sh)
 # Environment: OUT, folder for what must come back (runs/relay_out); STATE, what came back from the last leg (relay/);
-# LIMIT_S, seconds for everything (570); PRESET; PROCESSES; PYTHON. A step that fails lets the next begin.
+# LIMIT_S, seconds for everything (570); TABLES_S, seconds for the tables (300; 0 for none), and TABLES, their options;
+# PRESET; PROCESSES; PYTHON. A step that fails lets the next begin.
 set -u
 cd "$(dirname "$0")/.."
 begun=$(date +%s)
@@ -22,6 +24,11 @@ export PYTHONPATH="$PWD/src:$site" PYTHONUNBUFFERED=1 XDG_CACHE_HOME=$site/cache
 
 step smoke
 timeout -k 5 "${SMOKE_S:-90}" "$PYTHON" benchmarks/gpu_smoke.py
+
+if [ "${TABLES_S:-300}" -gt 0 ] && [ ! -e "$STATE/relay_manifest.json" ]; then
+    step tables
+    timeout -k 5 "${TABLES_S:-300}" "$PYTHON" benchmarks/gpu_tables.py ${TABLES:-}
+fi
 
 step relay
 if [ -e "$STATE/relay_manifest.json" ]; then

@@ -13,7 +13,7 @@ from lidargrit.core.errors import DataError, ScanError
 from lidargrit.data.trajectories import read_trajectory
 from lidargrit.scans.motion import Trajectory, UndoMotion
 from lidargrit.scans.types import Scan
-from lidargrit.simulator import observe, scene_of
+from lidargrit.simulator import observe, poses_of
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 
 RNG = np.random.default_rng(0)
@@ -79,8 +79,7 @@ def test_a_simulated_drive_is_restored_within_a_millimetre(monkeypatch):
     met = seen.clean_range_m > 0
     range_m, (origins, directions) = seen.clean_range_m[met][:, None], rays[0]
     scan = Scan(torch.from_numpy(seen.directions[met] * range_m), point_time_s=torch.from_numpy(seen.fired_s[met]))
-    scene = scene_of(SEED, "mixed")
-    ends = np.stack([scene.sensor_pose(time_s) for time_s in (0.0, REVOLUTION_S)])
+    ends = np.stack(poses_of(SEED, (0.0, REVOLUTION_S), VLP16))
     still, moved_m = UndoMotion(Trajectory(np.array([0.0, REVOLUTION_S]), ends))(replace(scan, time_s=0.0))
     world = origins.reshape(*met.shape, 3)[met] + directions.reshape(*met.shape, 3)[met] * range_m
     expected = (world - ends[0, :3, 3]) @ ends[0, :3, :3]
@@ -113,10 +112,8 @@ def test_the_verb_undoes_motion_by_a_file_of_poses_beside_the_scans(tmp_path, ca
 def test_poses_of_kitti_are_those_of_the_lidar(tmp_path):
     main(["simulate", f"{tmp_path}/drive", "-n", "3", "--frames", "3", "--sensor", "vlp16", "--seed", str(SEED)])
     known = read_trajectory(tmp_path / "drive/sequences/00")
-    scene = scene_of(SEED, "mixed")
-    begun = np.linalg.inv(scene.sensor_pose(0.0))
-    for at, time_s in enumerate(known.times_s):
-        np.testing.assert_allclose(known.poses[at], begun @ scene.sensor_pose(time_s), atol=1e-6)
+    for known_pose, pose in zip(known.poses, way := poses_of(SEED, known.times_s.tolist(), VLP16), strict=True):
+        np.testing.assert_allclose(known_pose, np.linalg.inv(way[0]) @ pose, atol=1e-6)
 
 
 @pytest.mark.parametrize(

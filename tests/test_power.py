@@ -4,36 +4,40 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.scans import classes
-from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.sensors import SensorSetup, load_sensor
 from lidargrit.simulator import materials
 from lidargrit.simulator.beams import Beams
 from lidargrit.simulator.kitti_car import hidden_by_car
 from lidargrit.simulator.mesh import Mesh
 from lidargrit.simulator.observation import ObservationConfig, observe_scene
-from lidargrit.simulator.power import Lasers, RaydropModel, Surfaces, received_power, reflectance, return_probability
+from lidargrit.simulator.power import RaydropModel, Surfaces, received_power, reflectance, return_probability
+from lidargrit.simulator.setups import PACKAGED
 from toy_scene import HEIGHT_M, ToyScene, box, quad, road, street, wall
 
 MODEL = RaydropModel()
-NO_GAPS = replace(MODEL, gap_share=0.0)
-SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(1024)
+SETUP = SensorSetup(range_sigma_m=0.02, log_gain=PACKAGED["hdl64e_kitti_odometry"].log_gain)
+GAPS = replace(SETUP, firing_jitter_rad=np.pi / 1024 / ndtri(1 - 0.033 / 2))
+SENSOR = replace(load_sensor("hdl64e_kitti_odometry").with_columns(1024), setup=SETUP)
 
 
-def look(scene, beam_seed=0, scene_seed=0, sensor=SENSOR, **config):
+def look(scene, beam_seed=0, scene_seed=0, sensor=SENSOR, setup=None, **config):
+    sensor = sensor if setup is None else replace(sensor, setup=setup)
     streams = (np.random.default_rng(seed) for seed in (scene_seed, beam_seed))
-    return observe_scene(scene, sensor, *streams, ObservationConfig(**{"model": NO_GAPS, **config}))
+    return observe_scene(scene, sensor, *streams, ObservationConfig(**config))
 
 
 @pytest.fixture(scope="module")
 def seen():
     """Return many looks at one scene; its objects keep their gains."""
-    return [look(street(), beam_seed=seed, model=MODEL) for seed in range(12)]
+    return [look(street(), beam_seed=seed, setup=GAPS) for seed in range(12)]
 
 
 def brightness(material, albedo, cos_incidence, model=MODEL, wet=0.0):
-    surfaces = Surfaces.of(wall(10.0, albedo, material), model, wet)
+    surfaces = Surfaces.of(wall(10.0, albedo, material), model, SETUP, wet)
     return float(surfaces.brightness(np.int32([0]), np.float32([cos_incidence]))[0])
 
 
@@ -43,9 +47,6 @@ def brightness(material, albedo, cos_incidence, model=MODEL, wet=0.0):
         ({"least_power": 0.0}, "got least_power=0; wanted a power above 0"),
         ({"patch_deg": 0.0}, "got patch_deg=0; wanted 0.01 or more"),
         ({"patch_deg": float("nan")}, "got patch_deg=nan"),
-        ({"gap_share": 1.0}, "got gap_share=1; wanted a share from 0 to less than 1"),
-        ({"gap_share": -0.1}, "got gap_share=-0.1"),
-        ({"laser_readings": (1.0,) * 32}, "got 64 laser_gains and 32 laser_readings"),
     ],
 )
 def test_a_model_with_which_no_scan_can_be_simulated_is_refused(change, message):
@@ -72,7 +73,7 @@ def test_surfaces_answer_by_their_material():
     assert oblique == pytest.approx(0.07 * paint.diffuse, rel=0.01)  # beside the lobe
     assert brightness(materials.FOIL, 0.5, 0.7) > 5 * brightness(materials.PLASTER, 0.5, 0.7)
     assert brightness(materials.PAINT, 0.1, 1.0, replace(MODEL, gloss=2.0)) == pytest.approx(square + paint.gloss)
-    assert Surfaces.of(road(), MODEL).brightness(np.int32([-1]), np.float32([0.0]))[0] == 0
+    assert Surfaces.of(road(), MODEL, SETUP).brightness(np.int32([-1]), np.float32([0.0]))[0] == 0
 
 
 def test_wet_ground_is_darker_but_for_a_mirror_like_lobe():
@@ -102,11 +103,11 @@ def test_drawn_mask_agrees_with_the_probability():
 def test_probability_is_that_of_a_log_normal_factor():
     levels = np.linspace(-1, 1, 9).astype(np.float32)
     draws = levels[:, None] + MODEL.pulse_spread * np.random.default_rng(0).standard_normal(100_000) > 0
-    expected = draws.mean(axis=1) * (1 - MODEL.gap_share)
-    assert np.allclose(return_probability(levels, MODEL), expected, atol=0.006)
-    assert return_probability(np.float32([-np.inf]), MODEL)[0] == 0
-    steady = replace(MODEL, pulse_spread=0.0, gap_share=0.0)
-    assert return_probability(np.float32([-0.1, 0.1]), steady).tolist() == [0, 1]
+    expected = draws.mean(axis=1) * (1 - 0.033)
+    assert np.allclose(return_probability(levels, MODEL, 0.033), expected, atol=0.006)
+    assert return_probability(np.float32([-np.inf]), MODEL, 0.033)[0] == 0
+    steady = replace(MODEL, pulse_spread=0.0)
+    assert return_probability(np.float32([-0.1, 0.1]), steady, 0.0).tolist() == [0, 1]
 
 
 def test_gaps_are_part_of_the_probability(seen):
@@ -114,7 +115,7 @@ def test_gaps_are_part_of_the_probability(seen):
     share = np.mean([s.return_mask[near_wall].mean() for s in seen])
     said = np.mean([s.return_probability[near_wall].mean() for s in seen])
     assert share == pytest.approx(said, abs=0.003)
-    assert said == pytest.approx(1 - MODEL.gap_share, abs=0.003)
+    assert said == pytest.approx(1 - 0.033, abs=0.003)
 
 
 def test_road_is_lost_in_the_distance():
@@ -135,7 +136,7 @@ def test_dark_bodies_drop_at_grazing_incidence_and_white_walls_do_not():
         low, high = np.array([15, 0, -4]), np.array([15, 0, 6])
         front = quad(low - aside, low + aside, high + aside, high - aside)
         scene = look(
-            ToyScene(Mesh.of(front, material, albedo, classes.CAR, 1)), model=replace(NO_GAPS, object_spread=0.0)
+            ToyScene(Mesh.of(front, material, albedo, classes.CAR, 1)), model=replace(MODEL, object_spread=0.0)
         )
         return scene.return_mask[:30][scene.instance[:30] == 1].mean()
 
@@ -147,10 +148,10 @@ def test_dark_bodies_drop_at_grazing_incidence_and_white_walls_do_not():
 
 def test_foil_is_seen_farther():
     def farthest_m(material):
-        model = replace(NO_GAPS, laser_gains=(0.0,) * 64, patch_spread=0.0, object_spread=0.0)
+        model, setup = replace(MODEL, patch_spread=0.0, object_spread=0.0), replace(SETUP, log_gain=())
         for far in range(20, 120, 10):
             plate = Mesh.of(quad((far, -4, 0), (far, 4, 0), (far, 4, 5), (far, -4, 5)), material, 0.02, 81, 1)
-            scene = look(ToyScene(plate), model=model)
+            scene = look(ToyScene(plate), model=model, setup=setup)
             if scene.return_mask[scene.instance == 1].mean() < 0.5:
                 return far
         return 120
@@ -186,9 +187,8 @@ def test_lasers_differ_and_keep_their_gain():
     gains = np.random.default_rng(0).normal(0, 1, 64)
 
     def lost(beam_seed, spread, sensor=SENSOR):
-        lasers = {"laser_gains": tuple(spread * gains), "laser_spread": spread}
-        model = replace(NO_GAPS, **lasers, patch_spread=0.0, pulse_spread=0.01)
-        return ~look(ToyScene(road()), beam_seed, sensor=sensor, model=model).return_mask[9:15]
+        model, setup = replace(MODEL, patch_spread=0.0, pulse_spread=0.01), SensorSetup(log_gain=tuple(spread * gains))
+        return ~look(ToyScene(road()), beam_seed, sensor=sensor, model=model, setup=setup).return_mask[9:15]
 
     for sensor in (SENSOR, load_sensor("hdl64e_kitti_360")):
         one, two, even = lost(0, 1.0, sensor), lost(1, 1.0, sensor), lost(0, 0.0, sensor)
@@ -196,24 +196,16 @@ def test_lasers_differ_and_keep_their_gain():
         assert (one == even).mean() < 0.9
 
 
-def test_lasers_of_kitti_are_its_own():
-    own = Lasers.of(SENSOR, MODEL)
-    assert own.log_gain[:, 0].tolist() == pytest.approx(MODEL.laser_gains)
-    assert own.reading[:, 0].tolist() == pytest.approx(MODEL.laser_readings)
-    drawn = Lasers.of(load_sensor("os1_128"), MODEL)
-    assert drawn.log_gain.shape == (128, 1)
-    assert drawn.log_gain.std() == pytest.approx(MODEL.laser_spread, rel=0.25)
-    assert (drawn.reading == 1).all()
-    for other in (load_sensor("hdl64e_kitti_360"), replace(SENSOR, name="hdl64e_kitti_of_mine")):
-        assert (Lasers.of(other, MODEL).reading == 1).all()
-    mine = Beams.sample(replace(SENSOR, name="hdl64e_kitti_of_mine"), np.random.default_rng(0), 0.0)
-    assert mine.clear.all(), "another's sensor is on another car"
+def test_another_sensor_is_on_another_car():
+    assert Beams.sample(replace(SENSOR, name="hdl64e_kitti_of_mine"), np.random.default_rng(0), 0.0).clear.all()
 
 
 def test_readings_of_lasers_reach_the_reflectance():
-    model = replace(NO_GAPS, laser_gains=(2.0,) * 64, reflectance_spread=0.0, object_spread=0.0, patch_spread=0.0)
+    model = replace(MODEL, reflectance_spread=0.0, object_spread=0.0, patch_spread=0.0)
+    setup = SensorSetup(log_gain=(2.0,) * 64)
     plain, dim = (
-        look(ToyScene(wall(8.0, 0.6)), model=replace(model, laser_readings=(factor,) * 64)) for factor in (1.0, 0.5)
+        look(ToyScene(wall(8.0, 0.6)), model=model, setup=replace(setup, reading=(factor,) * 64))
+        for factor in (1.0, 0.5)
     )
     square = plain.return_mask & (plain.cos_incidence > 0.9)
     assert np.array_equal(plain.return_mask, dim.return_mask)
@@ -235,7 +227,7 @@ def test_the_car_hides_the_same_rays_in_every_scan(seen):
 def test_measured_range_is_noisy_and_clean_range_is_not(seen):
     one = seen[0]
     difference = (one.range_m - one.clean_range_m)[one.return_mask]
-    assert difference.std() == pytest.approx(MODEL.range_sigma_m, rel=0.05)
+    assert difference.std() == pytest.approx(SETUP.range_sigma_m, rel=0.05)
     assert abs(difference.mean()) < 1e-3
     assert (one.range_m[~one.return_mask] == 0).all()
     flat = (one.label == classes.ROAD) & (one.clean_range_m > 5) & (one.clean_range_m < 12)

@@ -67,7 +67,8 @@ def test_its_runs_are_what_their_presets_make():
     assert generators == [preset.generator for preset in presets]
     seen["transformer"] += 18_000 + 36_000 + 30_000  # before they were trained further, as the card says
     seen["pixels"] += 17_000 + 9000 + 16_000
-    assert seen == {stage: fit.scans for preset in presets for stage, fit in preset.training.items()}
+    assert seen.pop("raydrop") == 3000  # on streets of version 2, after its preset's 4,000 on those of version 1
+    assert seen == {stage: fit.scans for preset in presets[:2] for stage, fit in preset.training.items()}
 
 
 def test_those_of_the_wide_one_are_what_their_presets_make():
@@ -121,28 +122,30 @@ def test_a_word_gives_scans(tmp_path, monkeypatch, capsys):
     assert ground > 0.35
 
 
-def test_its_networks_compute_what_they_did_when_they_were_scored(model, capsys):
+def test_its_networks_compute_what_they_did_when_streets_2_came(model, capsys):
     assert main(["likelihood", "simulated:8:test", "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)["reconstruction"]
-    assert errors["range_mae_m"] == pytest.approx(1.128, rel=0.02)
-    assert errors["mask_accuracy"] == pytest.approx(0.934, abs=0.004)
+    assert errors["range_mae_m"] == pytest.approx(1.325, rel=0.02)  # of streets 1, from which it learned, 1.128
+    assert errors["mask_accuracy"] == pytest.approx(0.920, abs=0.004)
     one = RangeImage.stack([project(simulate(seed=0), model.sensor)])
     bits = model.bits(one)
     found = {name: value.item() for name, value in bits.per_scan().items()}
     pixels, returns = 64 * 256, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(0.0890, abs=0.001)  # 3.95 nats a token; untrained 6.9
-    assert found["mask"] / pixels == pytest.approx(0.2691, abs=0.003)
-    assert found["range"] / returns == pytest.approx(4.706, abs=0.02)
+    assert found["tokens"] / pixels == pytest.approx(
+        0.0991, abs=0.001
+    )  # of streets 1 .0890, 3.95 nats a token; untrained 6.9
+    assert found["mask"] / pixels == pytest.approx(0.3000, abs=0.003)
+    assert found["range"] / returns == pytest.approx(5.369, abs=0.02)
 
 
-def test_the_wide_one_computes_what_it_did_when_it_was_scored():
+def test_the_wide_one_computes_what_it_did_when_streets_2_came():
     wide = load("pretrained_wide")
     one = RangeImage.stack([project(simulate(seed=0), wide.sensor)])
     found = {name: value.item() for name, value in wide.bits(one).per_scan().items()}
     pixels, returns = 64 * 1024, int(one.return_mask.sum())
-    assert found["tokens"] / pixels == pytest.approx(0.0877, abs=0.001)
-    assert found["mask"] / pixels == pytest.approx(0.2463, abs=0.003)
-    assert found["range"] / returns == pytest.approx(4.259, abs=0.01)
+    assert found["tokens"] / pixels == pytest.approx(0.0939, abs=0.001)
+    assert found["mask"] / pixels == pytest.approx(0.2714, abs=0.003)
+    assert found["range"] / returns == pytest.approx(4.757, abs=0.01)
     decoded = wide.reconstruct(one)  # a new scan takes ten times as long, and all but its tokens come the same way
     assert decoded.range_m.shape == (1, 64, 1024)
     assert 0.75 < decoded.return_mask.float().mean() < 0.95  # simulated streets: 0.86

@@ -214,7 +214,7 @@ runpy.run_module("lidargrit.data.prepared", run_name="__main__")
 
 
 def test_a_simulation_without_a_return_leaves_its_folder_free(tmp_path):
-    up = replace(load_sensor("vlp16").with_columns(32), elevation_rad=torch.linspace(1.2, 1.0, 16)[:, None])
+    up = replace(load_sensor("vlp16").with_columns(32), elevation_rad=torch.linspace(1.56, 1.54, 16)[:, None])
     with pytest.raises(DataError, match="no return in the simulated street"):
         write_drives(tmp_path / "drive", 1, DriveConfig(up))
     config = DriveConfig(load_sensor("vlp16").with_columns(32))

@@ -15,8 +15,8 @@ from lidargrit.evaluation.street_figures import (
     jumps_with_a_drop,
 )
 from lidargrit.scans.classes import BUILDING, CAR, LANE_MARKING, ROAD
-from lidargrit.scans.row_offsets import plane_residuals, row_offsets
 from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.surface_patches import plane_residuals, row_offsets
 from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
@@ -106,10 +106,11 @@ def test_residuals_of_planes_against_a_slow_loop():
             if not image.return_mask[at].all():
                 continue
             range_m, rays = image.range_m[at].double().numpy().ravel(), directions[at].reshape(-1, 3)
-            if range_m.max() > 1.5 * range_m.min() or range_m.max() > 40:
+            if range_m.max() > 3 * range_m.min() or range_m.max() > 40:
                 continue
-            off_m = range_m - 1 / (rays @ np.linalg.lstsq(rays, 1 / range_m)[0])
-            if np.sqrt((off_m**2).mean()) <= 0.1:
+            normal = np.linalg.lstsq(rays, 1 / range_m)[0]
+            off_m = range_m - 1 / (rays @ normal)
+            if np.sqrt((off_m**2).mean()) <= 0.1 and np.linalg.norm(normal) * range_m.mean() <= 1 / 0.15:
                 for step in range(9):
                     residuals[row + step] += off_m.reshape(9, 5)[step].tolist()
     slow = [np.median(each) if len(each) >= 50 else np.nan for each in residuals]

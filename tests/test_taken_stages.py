@@ -301,5 +301,8 @@ def test_runs_that_are_no_donors(tmp_path):
     made().save(tmp_path)
     with pytest.raises(ConfigError, match="a run of 'r2dm', or of another with the same stage 'diffusion'; choose"):
         check_stages(load_preset("r2dm_small", (f"training.diffusion.start={tmp_path}",)))
+    with pytest.raises(ConfigError, match=r"; set training\.segmenter\.start=pretrained/segmenter"):
+        check_stages(load_preset("segmenter_compact", ("training.segmenter.start=pretrained",)))
+    check_stages(load_preset("segmenter_compact", ("training.segmenter.start=pretrained/segmenter",)))
     nothing = load_preset("lidargrit_small", ("training.tokenizer.start=",))
     assert nothing.start_runs == nothing.frozen == {}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidargrit.scans import classes
-from lidargrit.scans.sensors import load_sensor
+from lidargrit.scans.sensors import SensorSetup, load_sensor
 from lidargrit.simulator import materials
 from lidargrit.simulator.beams import REVOLUTION_S, Beams, footprint
 from lidargrit.simulator.echoes import detect_echoes, edges
@@ -15,7 +15,7 @@ from lidargrit.simulator.power import RaydropModel, Surfaces, received_power
 from lidargrit.simulator.tracing import NOTHING, Tracer, in_reach
 from toy_scene import HEIGHT_M, ToyScene, box, road, street, wall
 
-MODEL = RaydropModel()
+MODEL, SETUP = RaydropModel(), SensorSetup()
 DIFFUSE = MODEL.materials[materials.PLASTER].diffuse  # the walls and boxes of these tests are of plaster
 
 
@@ -52,7 +52,7 @@ def ahead(*heights_m):
 
 
 def test_hits_agree_with_a_slow_loop():
-    mesh = street(leaves=40).mesh()
+    mesh = street(leaves=40).standing
     origins, directions = random_rays(200)
     hits = Tracer(mesh).cast(origins, directions)
     slow = [meet_slowly(mesh.triangles_m, o.astype(float), d.astype(float)) for o, d in zip(origins, directions)]  # noqa: B905
@@ -92,32 +92,32 @@ def test_what_is_out_of_reach_is_never_met(elevations_deg):
 
 def test_glass_lets_a_part_through_twice():
     mesh = Mesh.join([wall(8.0, 0.02, materials.GLASS), wall(20.0, 0.5), wall(30.0, 0.5)])
-    tracer, surfaces, rays = Tracer(mesh), Surfaces.of(mesh, MODEL), ahead(0)
+    tracer, surfaces, rays = Tracer(mesh), Surfaces.of(mesh, MODEL, SETUP), ahead(0)
     first = tracer.cast(*rays)
     behind, light = tracer.cast_through(*rays, first, surfaces.passing())
-    passes = materials.MATERIALS[materials.GLASS].passes
+    passes = SETUP.glass_passes
     assert first.range_m == pytest.approx(8)
     assert behind.range_m == pytest.approx(20, abs=1e-3)
     assert light == pytest.approx(passes**2)
-    echo = detect_echoes(tracer, surfaces, rays, first, np.array([False]), MODEL)
+    echo = detect_echoes(tracer, surfaces, rays, first, np.array([False]), MODEL, SETUP)
     assert echo.range_m == pytest.approx(20, abs=1e-3)
     assert echo.power == pytest.approx(passes**2 * 0.5 * DIFFUSE / (20**2 + MODEL.near_m**2), rel=1e-3)
     assert first.range_m == pytest.approx(8)  # what was handed in is as it was
-    shut = replace(MODEL, materials=tuple(replace(m, passes=0.0) for m in MODEL.materials))
-    echo = detect_echoes(tracer, Surfaces.of(mesh, shut), rays, first, np.array([False]), shut)
+    shut = replace(SETUP, glass_passes=0.0)
+    echo = detect_echoes(tracer, Surfaces.of(mesh, MODEL, shut), rays, first, np.array([False]), MODEL, shut)
     assert echo.range_m == pytest.approx(8)
 
 
 def test_light_ends_behind_two_panes_and_beyond_reach():
     panes = [wall(5.0 + k, 0.02, materials.GLASS) for k in range(3)]
     mesh, rays = Mesh.join([*panes, wall(20.0, 0.5)]), ahead(0)
-    surfaces = Surfaces.of(mesh, MODEL)
+    surfaces = Surfaces.of(mesh, MODEL, SETUP)
     behind, light = Tracer(mesh).cast_through(*rays, Tracer(mesh).cast(*rays), surfaces.passing())
     assert behind.range_m == pytest.approx(7, abs=1e-3)
-    assert light == pytest.approx(materials.MATERIALS[materials.GLASS].passes ** 4)
+    assert light == pytest.approx(SETUP.glass_passes**4)
     near = Mesh.join([panes[0], wall(20.0, 0.5)])
     tracer = Tracer(near, reach_m=15.0)
-    behind, _ = tracer.cast_through(*rays, tracer.cast(*rays), Surfaces.of(near, MODEL).passing())
+    behind, _ = tracer.cast_through(*rays, tracer.cast(*rays), Surfaces.of(near, MODEL, SETUP).passing())
     assert behind.triangle[0] == NOTHING
     assert np.isinf(behind.range_m[0])
 
@@ -128,7 +128,7 @@ def test_planes_have_no_edges_and_boxes_have():
 
     def edge(*parts):
         scene = ToyScene(*parts)
-        first = Tracer(scene.mesh()).cast(*beams.rays(scene.sensor_pose()))
+        first = Tracer(scene.standing).cast(*beams.rays(scene.sensor_pose()))
         range_m = first.range_m.reshape(64, 1024)
         found = edges(range_m, np.roll(range_m, 1, 1), np.roll(range_m, -1, 1), MODEL.edge_share)
         return found, first.triangle.reshape(64, 1024), range_m
@@ -147,12 +147,13 @@ def test_planes_have_no_edges_and_boxes_have():
 
 
 def test_beams_at_edges_mix_near_surfaces_and_choose_between_far_ones():
-    def heard(gap_m, albedo):
+    def heard(gap_m, albedo, setup=SETUP):
         # The left half of the beam meets a front; the rest passes by and meets the wall behind.
         front = np.array([[(10, 0.0003, -5), (10, 9, -5), (10, 9, 9)], [(10, 0.0003, -5), (10, 9, 9), (10, 0.0003, 9)]])
         mesh = Mesh.join([Mesh.of(front, materials.PLASTER, albedo, 50), wall(10 + gap_m, 0.5)])
         tracer, rays = Tracer(mesh), ahead(0)
-        return detect_echoes(tracer, Surfaces.of(mesh, MODEL), rays, tracer.cast(*rays), np.array([True]), MODEL)
+        surfaces = Surfaces.of(mesh, MODEL, setup)
+        return detect_echoes(tracer, surfaces, rays, tracer.cast(*rays), np.array([True]), MODEL, setup)
 
     near = heard(0.4, 0.5)
     assert 10.05 < near.range_m < 10.35  # neither the one nor the other
@@ -161,6 +162,10 @@ def test_beams_at_edges_mix_near_surfaces_and_choose_between_far_ones():
     assert near.range_m == pytest.approx((weights * [10, 10.4]).sum() / weights.sum(), abs=1e-3)
     assert heard(5.0, 0.9).range_m == pytest.approx(10, abs=1e-3)
     assert heard(5.0, 0.1).range_m == pytest.approx(15, abs=1e-3)
+    strict = replace(SETUP, split_exponent=3.0)
+    assert heard(0.4, 0.5, strict).power == pytest.approx(near.power)  # heard as one
+    for albedo, share in ((0.9, 2 / 5), (0.1, 3 / 5)):  # of the beam lies on the surface that answers
+        assert heard(5.0, albedo, strict).power == pytest.approx(heard(5.0, albedo).power * share**3)
 
 
 def test_footprint_lies_within_the_beam():
@@ -190,11 +195,12 @@ def test_rays_of_tables_and_of_lasers_that_look_aside():
 
 def test_jitter_stays_in_the_column_and_leaves_gaps():
     sensor = load_sensor("hdl64e_kitti_odometry")
-    beams = Beams.sample(sensor, np.random.default_rng(3), 0.033)
+    beams = Beams.sample(sensor, np.random.default_rng(3), 0.000719475)
     column = (np.pi - beams.azimuth_rad.astype(np.float64)) / (2 * np.pi) * 2048
     assert np.array_equal(np.floor(column), np.broadcast_to(np.arange(2048), (64, 2048)))
     assert 0.2 < (column % 1).std() < 0.25
     assert (~beams.fired).mean() == pytest.approx(0.033, abs=0.002)
+    assert beams.gap_share == pytest.approx(0.033, abs=1e-5)
     pairs = ~beams.fired[:, 1:] & ~beams.fired[:, :-1]
     assert pairs.mean() < 0.003  # alone
     assert 0.85 < beams.clear.mean() < 0.95
@@ -222,6 +228,7 @@ def test_power_of_nothing_is_nothing():
     assert received_power(np.float32([0.3]), np.float32([np.inf]), MODEL)[0] == 0
     mesh, (origins, directions) = road(), ahead(5)
     hits = Tracer(mesh).cast(origins, directions)
-    echo = detect_echoes(Tracer(mesh), Surfaces.of(mesh, MODEL), (origins, directions), hits, np.array([True]), MODEL)
+    surfaces = Surfaces.of(mesh, MODEL, SETUP)
+    echo = detect_echoes(Tracer(mesh), surfaces, (origins, directions), hits, np.array([True]), MODEL, SETUP)
     assert echo.power[0] == 0
     assert echo.triangle[0] == NOTHING

@@ -2,15 +2,14 @@
 
 import functools
 import json
-import math
 import os
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import CheckpointError, ConfigError, OutputError, TrainingError
@@ -26,9 +25,9 @@ from lidargrit.generation.tokenizers.vqvae import Vqvae
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.r2flow.rectified_flow import ReflowConfig
-from lidargrit.training import check_folder, train
+from lidargrit.training import check_folder, measure, train, training_flops
 from lidargrit.training.checkpoint import load_checkpoint, save_checkpoint
-from lidargrit.training.log import read_log
+from lidargrit.training.log import Log, read_log
 from lidargrit.training.optimiser import WeightAverage, learning_rate_at, make_optimiser, memory_of_weights
 from lidargrit.training.stage import StageTraining
 from lidargrit.viewer import plot_progress
@@ -211,59 +210,6 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
     assert "checkpoint" not in str(error.value), "there is none yet"
 
 
-class MeanRange(Objective):
-    """A number that learns the mean range, whose loss is not finite from some step on; notes the reads so far."""
-
-    def __init__(self, sensor, reads, breaks_at=10**9):
-        super().__init__(sensor)
-        self.mean = torch.nn.Parameter(torch.tensor(1.0))
-        self.reads, self.breaks_at, self.reads_before = reads, breaks_at, []
-
-    def forward(self, example, rng, player=""):
-        self.reads_before.append(self.reads.count)
-        loss = (example.images.range_m.mean() - self.mean).square()
-        return {"loss": loss * math.nan if len(self.reads_before) > self.breaks_at else loss}
-
-
-class Reads(TorchDispatchMode):
-    """Counts where a number of a tensor is asked for, which waits for a GPU; whole numbers are those of the order."""
-
-    count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func is torch.ops.aten._local_scalar_dense.default and args[0].dtype != torch.long
-        return func(*args, **(kwargs or {}))
-
-    def __deepcopy__(self, memo):
-        return self
-
-
-def mean_range_on_a_gpu(folder, images, breaks_at=10**9):
-    """Return an objective and its training of 50 steps, in which numbers are not seen at once, as on a GPU."""
-    objective = MeanRange(images.sensor, Reads(), breaks_at)
-    config = TrainingConfig(scans=100, batch_size=2, learning_rate=1e-3, checkpoint_every=60)
-    fit = StageTraining(objective, config, folder, 0).begun()
-    fit.engine.sees_at_once = False
-    return objective, fit
-
-
-def test_on_a_gpu_the_host_waits_for_every_twentieth_step_and_for_checkpoints(tmp_path, images):
-    objective, fit = mean_range_on_a_gpu(tmp_path, images)
-    with objective.reads:
-        fit.run(images, images, "training")
-    waits = [step for step, count in enumerate(np.diff(objective.reads_before[:50]), start=1) if count]
-    assert waits == [20, 30, 40]
-    assert [entry["scans_seen"] for entry in read_log(tmp_path / "log.jsonl") if entry["split"] == "train"] == [40, 80]
-
-
-def test_on_a_gpu_no_checkpoint_holds_numbers_that_are_not_finite(tmp_path, images):
-    objective, fit = mean_range_on_a_gpu(tmp_path, images, breaks_at=32)
-    with pytest.raises(TrainingError, match=r"a loss or gradient of nan after 80 scans.*last checkpoint is"):
-        fit.run(images, images, "training")
-    assert len(objective.reads_before) == 40
-    assert all(bool(tensor.isfinite().all()) for tensor in read_tensors(fit.checkpoint)[0].values())
-
-
 @pytest.mark.shared
 @pytest.mark.timeout(600)  # half a minute on a quiet core, minutes on a busy one
 def test_one_real_scan_is_learned_by_heart(tmp_path, real):
@@ -294,6 +240,13 @@ def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
     # Sums of a batch of two and of one may differ in their last bit, and a mask drawn there in a pixel.
     assert float((first.range_m[1] - again.range_m[0]).abs().gt(1e-3).float().mean()) < 1e-3
     assert first.range_m.shape == (2, 64, 64)
+
+
+def test_stages_use_their_own_settings():
+    preset = load_preset("lidargrit_demo", ["training.transformer.learning_rate=0.5"])
+    assert preset.training["transformer"].learning_rate == 0.5
+    assert preset.training["tokenizer"] == load_preset("lidargrit_demo").training["tokenizer"]
+    assert replace(preset, seed=1) != preset
 
 
 def test_a_run_goes_on_though_the_words_about_its_preset_have_changed(tmp_path):
@@ -361,6 +314,56 @@ def test_the_memory_of_weights_is_what_a_step_leaves_behind(images):
     held += [parameter.grad for parameter in vqvae.parameters() if parameter.grad is not None]
     held += [value for state in optimiser.state.values() for name, value in state.items() if name != "step"]
     assert memory_of_weights(vqvae) == sum(tensor.nbytes for tensor in held)
+
+
+def test_a_measured_plan_tells_operations_time_and_memory():
+    preset = load_preset("lidargrit_demo", TINY)
+    lines = [stage.as_text() for stage in measure(preset)]
+    for line, (stage, flops) in zip(lines, training_flops(preset).items(), strict=True):
+        wanted = rf"{stage}: {flops:.2e} floating-point operations at [\d.e+]+ scans/s: [\d.]+ \w+ on cpu, [\d.]+ GiB"
+        assert re.fullmatch(wanted.replace("e+", "e\\+", 1), line)
+
+
+def test_lines_that_are_no_entries_of_a_log_are_passed_over(tmp_path):
+    good = '{"scans_seen": 4, "split": "train", "seconds": 1.5}\n'
+    bad = [
+        "{}",
+        "[]",
+        "null",
+        '{"scans_seen": "4", "seconds": 1}',
+        "[" * 50_000,
+        '{"a": 1e400}',
+        '{"scans_seen": 4, "se',
+    ]
+    content = "".join(f"{line}\n" for line in (good.strip(), *bad, good.strip())).encode() + b"\xff\xfe"
+    (tmp_path / "log.jsonl").write_bytes(content)
+    assert [entry["seconds"] for entry in read_log(tmp_path / "log.jsonl")] == [1.5, 1.5]
+    Log(tmp_path, 4).write("val", 8, 2.0, {"loss": float("nan")})
+    lines = (tmp_path / "log.jsonl").read_text().splitlines()
+    assert lines[:-1] == [good.strip()] * 2
+    assert json.loads(lines[-1])["loss"] is None
+
+
+def test_tensorboard_draws_what_the_log_says(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = Log(tmp_path, 0)
+    log.write("train", 4, 1.0, {"loss": 0.5})
+    log.write("train", 8, 2.0, {"loss": 0.25})
+    log.close()
+    again = Log(tmp_path, 4)  # killed after the checkpoint at 4 scans
+    again.write("train", 8, 2.0, {"loss": 0.125})
+    again.close()
+    seen = EventAccumulator(str(tmp_path)).Reload().Scalars("loss/train")
+    assert [(event.step, event.value) for event in seen] == [(4, 0.5), (8, 0.125)]
+    assert [json.loads(line)["loss"] for line in (tmp_path / "log.jsonl").read_text().splitlines()] == [0.5, 0.125]
+
+
+def test_the_log_is_written_without_tensorboard(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    (log := Log(tmp_path, 0)).write("train", 4, 1.0, {"loss": 0.5})
+    log.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["log.jsonl"]
 
 
 def test_a_checkpoint_that_does_not_fit_its_optimiser_is_refused(tmp_path):

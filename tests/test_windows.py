@@ -8,7 +8,7 @@ from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.simulator import FRAME_S, scene_of
+from lidargrit.simulator import FRAME_S, poses_of
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128)
 
@@ -27,10 +27,10 @@ def test_windows_of_simulated_drives_are_in_order_and_stay_within_a_drive(drives
     assert [window.indices for window in scans.windows(3)] == [(0, 1, 2), (3, 4, 5)]
     assert scans.windows(4) == []
     for window, seed in zip(scans.windows(3), (5, 6), strict=True):
-        scene, found = scene_of(seed, "mixed"), window.scans()
+        poses, found = poses_of(seed, [FRAME_S * frame for frame in range(3)], SENSOR), window.scans()
         assert [scan.time_s for scan in found] == pytest.approx([0, 0.1, 0.2])
         for frame, scan in enumerate(found):
-            moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(FRAME_S * frame)
+            moved = np.linalg.inv(poses[0]) @ poses[frame]
             assert scan.pose is not None
             assert np.allclose(scan.pose.numpy(), moved, atol=1e-6)
             assert torch.equal(scan.points_xyz_m, scans.scan(window.indices[frame]).points_xyz_m)

@@ -4,7 +4,7 @@ import numpy as np
 
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
-from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.mesh import Mesh, Objects
 
 HEIGHT_M = 1.73
 
@@ -42,16 +42,16 @@ class ToyScene:
     theme = "city"
 
     def __init__(self, *parts, speed_m_s=0.0, turn_rad_s=0.0):
-        self.parts, self.speed_m_s, self.turn_rad_s = Mesh.join(parts), speed_m_s, turn_rad_s
+        self.standing, self.speed_m_s, self.turn_rad_s = Mesh.join(parts), speed_m_s, turn_rad_s
 
-    def mesh(self, time_s=0.0):
-        return self.parts
+    def objects(self, time_s=0.0):
+        return Objects.none()
 
-    def sensor_pose(self, time_s=0.0):
+    def sensor_pose(self, time_s=0.0, height_m=HEIGHT_M):
         angle = self.turn_rad_s * time_s
         pose = np.eye(4)
         pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        pose[:3, 3] = self.speed_m_s * time_s, 0.0, HEIGHT_M
+        pose[:3, 3] = self.speed_m_s * time_s, 0.0, height_m
         return pose
 
 

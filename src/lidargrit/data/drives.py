@@ -19,10 +19,11 @@ from lidargrit.core.files import (
     write_text,
 )
 from lidargrit.core.shares import each_done
+from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import begun_by
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, scene_of
+from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, poses_of
 
 MANIFEST = "simulated.json"
 _SHARE, _SHARE_ON_RAY = 4, 16  # scans: seconds of work, for a task takes a cluster 30 ms
@@ -72,7 +73,7 @@ class DriveConfig:
 
     def to_json(self) -> dict[str, Any]:
         """Return all that the scans depend on."""
-        return {**vars(self), "sensor": self.sensor.to_json()}
+        return {**vars(self), "sensor": self.sensor.to_json(), "streets": STREETS_VERSION}
 
 
 def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1, ray: str = "") -> int:
@@ -180,13 +181,15 @@ def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> Non
     """Write what a sequence has once: poses in KITTI's form, times and calibration."""
     poses: dict[str, list[Float64[np.ndarray, "4 4"]]] = {}
     for first in range(0, num_scans, config.frames):
-        scene = scene_of(config.street_of(first)[0], config.theme) if config.frames > 1 else None
-        for scan in range(first, min(first + config.frames, num_scans)):
-            relative = np.eye(4)
-            if scene is not None:
-                moved = np.linalg.inv(scene.sensor_pose()) @ scene.sensor_pose(FRAME_S * (scan - first))
-                relative = _CAMERA_FROM_SENSOR @ moved @ np.linalg.inv(_CAMERA_FROM_SENSOR)
-            poses.setdefault(config.sequence_and_number(scan)[0], []).append(relative)
+        scans = range(first, min(first + config.frames, num_scans))
+        relative = [np.eye(4)]
+        if config.frames > 1:
+            times_s = [FRAME_S * (scan - first) for scan in scans]
+            way = poses_of(config.street_of(first)[0], times_s, config.sensor, config.theme)
+            moved = [np.linalg.inv(way[0]) @ pose for pose in way]
+            relative = [_CAMERA_FROM_SENSOR @ each @ np.linalg.inv(_CAMERA_FROM_SENSOR) for each in moved]
+        for scan, pose in zip(scans, relative, strict=True):
+            poses.setdefault(config.sequence_and_number(scan)[0], []).append(pose)
     projection = _numbers(np.eye(3, 4))
     calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
     for sequence, relative in poses.items():

@@ -46,6 +46,12 @@ class Provenance:
     fingerprints: tuple[str, ...] = ()
     range_fingerprints: tuple[str, ...] = ()
 
+    @property
+    def streets(self) -> tuple[str, ...]:
+        """Versions of the simulated streets among the recordings, such as "streets 2"; before there were several, 1."""
+        parts = {tuple(each.split("/")) for each in self.recordings if each.startswith("simulated/")}
+        return tuple(sorted({part[1] if len(part) > 2 else "streets 1" for part in parts}))
+
     @classmethod
     def joined(cls, parts: "Sequence[Provenance]") -> "Provenance":
         """Join the provenances of several sets, in their order."""

@@ -32,6 +32,7 @@ class EvalSet:
         projection_variant: variant by which scans became images; "" where it is not known.
         weights_sha256: hash of the weights that generated the images; "" where there are none, or it is not known.
         full_rows: rows in which every ray returns, with none in the others; None where rays may drop.
+        streets: versions of the simulated streets that a model of the images learned from.
     """
 
     source: str
@@ -43,6 +44,7 @@ class EvalSet:
     projection_variant: str = ""
     weights_sha256: str = ""
     full_rows: range | None = None
+    streets: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -69,6 +71,7 @@ class EvalSet:
             f"{sensor.projection}, {self.projection_variant or 'variant not known'}",
             self._sha256,
             self.weights_sha256,
+            self.streets or self.images.provenance.streets,
         )
 
     @cached_property
@@ -197,6 +200,7 @@ class Opened:
             self.projection_variant,
             source.weights_sha256,
             source.full_rows,
+            (source.learned_from() or Provenance()).streets,
         )
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.table import render
-from lidargrit.data.datasets.shared.streets import Streets
+from lidargrit.data.datasets.shared.streets import STREETS_VERSION, Streets
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import open_source
 from lidargrit.evaluation.comparison import EvalConfig
@@ -61,7 +61,7 @@ def evaluate_streets(
     scores = compare(simulated, real, beside=another)
     figures = scans.figures(other)
     about = {"protocol": "streets", "samples": samples, "reference": reference, "settings": config.facts()}
-    about |= {"beside": beside} if beside else {}
+    about |= {"streets": STREETS_VERSION} | ({"beside": beside} if beside else {})
     found = {"curves": [each.to_json() for each in scores], "raydrop": [each.to_json() for each in of_model]}
     found |= {"figures": {name.replace(" ", "_"): each.to_json() for name, each in figures.items()}}
     return render([*tables([*scores, *of_model]), figures_table(figures)]), {**about, **found}, scores

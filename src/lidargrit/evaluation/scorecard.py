@@ -38,6 +38,7 @@ class EvalSetRecord:
         data_set: name of the data set; "samples" for generated scans.
         sha256: hash of the pixels that were compared.
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
+        streets: versions of the simulated streets that the scans are of, or that their model learned from.
         file_sha256: hash of the reference file that stood in for the scans; "" where these were here.
     """
 
@@ -50,6 +51,7 @@ class EvalSetRecord:
     projection: str
     sha256: str
     weights_sha256: str = field(default="", compare=False)  # equal pixels are equal
+    streets: tuple[str, ...] = field(default=(), compare=False)
     file_sha256: str = field(default="", compare=False)
 
 
@@ -155,6 +157,8 @@ class Scorecard:
         notes = notes_on_floors(self.scores)
         notes += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
         notes += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
+        versions = sorted({*self.samples.streets, *self.reference.streets})
+        notes += [f"simulated streets: {', '.join(versions)}"] * bool(versions)
         table = Table(_HEAD, tuple(rows), sentences=(*self.verdict.sentences, ""), notes=tuple(notes))
         return table.without_empty("pixel statistics").as_text()
 

@@ -20,7 +20,7 @@ from lidargrit.evaluation.metrics.wall_straightness import (
 )
 from lidargrit.scans.classes import CLASSES
 from lidargrit.scans.projection import points_of_pixels
-from lidargrit.scans.row_offsets import plane_residuals
+from lidargrit.scans.surface_patches import plane_residuals
 from lidargrit.scans.types import RangeImage
 
 _COLUMN_RUN = 10  # rows: at 10 m an HDL-64E sees 60 cm of a wall in so many

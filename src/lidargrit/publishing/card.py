@@ -110,6 +110,8 @@ def _data(about: dict[str, Any], learned: Provenance) -> str:
     lines += ["", *dict.fromkeys(leaks)]
     if variant := preset_settings(about).get("data.projection_variant"):
         lines.append(f"The training scans were projected by the {_code(variant)} variant; project others by the same.")
+    if learned.streets:
+        lines.append(f"The simulated streets are {' and '.join(learned.streets)}.")
     if learned.fingerprints:
         lines.append(f"The model was trained on {len(learned.fingerprints):,} different images.")
     return "\n".join(lines)

@@ -24,6 +24,7 @@ Group = Literal["", "road", "sidewalk", "terrain", "building", "vegetation", "ve
 CAR: Final = 10
 BICYCLE: Final = 11
 MOTORCYCLE: Final = 15
+BUS: Final = 13
 TRUCK: Final = 18
 OTHER_VEHICLE: Final = 20
 PERSON: Final = 30
@@ -46,6 +47,7 @@ OTHER_OBJECT: Final = 99
 MOVING_CAR: Final = 252
 MOVING_BICYCLIST: Final = 253
 MOVING_PERSON: Final = 254
+MOVING_BUS: Final = 257
 MOVING_TRUCK: Final = 258
 
 _CAR, _CYCLE, _LARGE, _PERSON = (74, 144, 226), (38, 183, 190), (118, 106, 232), (232, 64, 64)
@@ -74,7 +76,7 @@ CLASSES: Final[dict[int, SemanticClass]] = {
     1: SemanticClass("outlier", _OBJECT, 0, ""),
     CAR: SemanticClass("car", _CAR, CAR, "vehicle"),
     BICYCLE: SemanticClass("bicycle", _CYCLE, BICYCLE, "person, cycle"),
-    13: SemanticClass("bus", _LARGE, OTHER_VEHICLE, "vehicle"),
+    BUS: SemanticClass("bus", _LARGE, OTHER_VEHICLE, "vehicle"),
     MOTORCYCLE: SemanticClass("motorcycle", _CYCLE, MOTORCYCLE, "person, cycle"),
     16: SemanticClass("rail vehicle", _LARGE, OTHER_VEHICLE, "vehicle"),
     TRUCK: SemanticClass("truck", _LARGE, TRUCK, "vehicle"),
@@ -101,7 +103,7 @@ CLASSES: Final[dict[int, SemanticClass]] = {
     MOVING_PERSON: SemanticClass("moving person", _PERSON, PERSON, "person, cycle"),
     255: SemanticClass("moving motorcyclist", _PERSON, MOTORCYCLIST, "person, cycle"),
     256: SemanticClass("moving rail vehicle", _LARGE, OTHER_VEHICLE, "vehicle"),
-    257: SemanticClass("moving bus", _LARGE, OTHER_VEHICLE, "vehicle"),
+    MOVING_BUS: SemanticClass("moving bus", _LARGE, OTHER_VEHICLE, "vehicle"),
     MOVING_TRUCK: SemanticClass("moving truck", _LARGE, TRUCK, "vehicle"),
     259: SemanticClass("moving other vehicle", _LARGE, OTHER_VEHICLE, "vehicle"),
 }

@@ -1,8 +1,12 @@
 """Simulated scans: a seed → a scene of triangles → the returns of a sensor in it."""
 
+import copy
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import get_args
 
 import numpy as np
+from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -12,13 +16,25 @@ from lidargrit.simulator.observation import Observation, ObservationConfig, obse
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
 from lidargrit.simulator.scene.street_plan import sample_street_plan
+from lidargrit.simulator.setups import setup_of
 
-__all__ = ["Observation", "RaydropModel", "Scene", "Theme", "frames_of", "observe", "scene_of", "simulate"]
+__all__ = [
+    "Observation",
+    "RaydropModel",
+    "Scene",
+    "Theme",
+    "frames_of",
+    "observe",
+    "poses_of",
+    "scene_of",
+    "simulate",
+]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
 FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
 ROAD_M = 100.0  # that our car drives at most: 0.97 of the returns are still there, after 120 m 0.72, after 140 m 0.17
 _HDL64E_OF_KITTI = RaydropModel()
+_DEFAULT = "hdl64e_kitti_odometry"
 
 
 def simulate(
@@ -97,20 +113,40 @@ def observe(
         arrays of one value for each pixel of ``sensor.fine()``, or of ``sensor`` if ``kept_columns_only``.
     """
     check_settings(seed, theme, frame, wet)
-    sensor = sensor or load_sensor("hdl64e_kitti_odometry")
+    sensor = sensor or load_sensor(_DEFAULT)
     root = np.random.default_rng(seed)
-    street_rng, beam_rng = root.spawn(2)
+    beam_rng = root.spawn(2)[1]
     if frame:
         beam_rng = root.spawn(frame)[-1]
-    scene = sample_scene(street_rng, theme)
+    scene, street_rng = _street(seed, theme)
     config = ObservationConfig(FRAME_S * frame, motion, wet, kept_columns_only, model)
-    return observe_scene(scene, sensor, street_rng, beam_rng, config)
+    return observe_scene(scene, sensor, copy.deepcopy(street_rng), beam_rng, config)
+
+
+@lru_cache(maxsize=1)  # all frames of a drive have one street
+def _street(seed: int, theme: Theme) -> tuple[Scene, np.random.Generator]:
+    """Return the street of a seed, and its random stream after it was sampled."""
+    street_rng = np.random.default_rng(seed).spawn(2)[0]
+    return sample_scene(street_rng, theme), street_rng
 
 
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
     """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car."""
     check_settings(seed, theme)
-    return sample_scene(np.random.default_rng(seed).spawn(2)[0], theme)
+    return _street(seed, theme)[0]
+
+
+def poses_of(
+    seed: int, times_s: Sequence[float], sensor: SensorModel | None = None, theme: Theme = "mixed"
+) -> list[Float64[np.ndarray, "4 4"]]:
+    """Return the frame of the sensor in the street of a seed, at times in seconds after the first revolution begins.
+
+    The height above the road is that of the sensor's set-up.
+    """
+    check_settings(seed, theme)
+    scene, street_rng = _street(seed, theme)
+    height_m = setup_of(sensor or load_sensor(_DEFAULT), copy.deepcopy(street_rng)).height_m
+    return [scene.sensor_pose(time_s, height_m) for time_s in times_s]
 
 
 def frames_of(seed: int, theme: Theme = "mixed") -> int:

@@ -9,7 +9,6 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
-from scipy.special import ndtri
 
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.simulator.kitti_car import hidden_by_car, is_on_car
@@ -27,6 +26,7 @@ class Beams:
         turn: share of the revolution, 0 to 1, after which the ray is fired.
         fired: False where no firing falls into the pixel.
         clear: False where the ray ends on the car that carries the sensor.
+        gap_share: expected share of pixels without a firing, which is 1 less the mean of ``fired``.
     """
 
     elevation_rad: Float32[np.ndarray, "H #W"]
@@ -34,24 +34,25 @@ class Beams:
     turn: Float32[np.ndarray, "#H W"]
     fired: Bool[np.ndarray, "H W"]
     clear: Bool[np.ndarray, "H W"]
+    gap_share: float
 
     @classmethod
-    def sample(cls, sensor: SensorModel, rng: np.random.Generator, gap_share: float) -> "Beams":
+    def sample(cls, sensor: SensorModel, rng: np.random.Generator, jitter_rad: float) -> "Beams":
         """Aim at every fine column of a sensor, with the small jitter of a turning head.
 
         A pixel whose ray leaves its column by the jitter gets no firing.
 
         Args:
             sensor: sensor to simulate; columns that its image leaves out are included.
-            gap_share: share of pixels without a firing, which determines the strength of the jitter.
+            jitter_rad: standard deviation of the azimuth at which a laser fires, in radians.
         """
         elevation, azimuth, turn, phase, clear = _aims(sensor)
-        sigma = 0.5 / float(ndtri(1 - gap_share / 2))  # of the jitter in columns: so many fall beyond half a column
-        jitter = rng.standard_normal(clear.shape, dtype=np.float32) * np.float32(sigma)
+        step = np.float32(2 * math.pi / clear.shape[1])
+        jitter = rng.standard_normal(clear.shape, dtype=np.float32) * (np.float32(jitter_rad) / step)  # in columns
         fired = np.abs(jitter) <= 0.5
         aside = np.clip(jitter + phase, -0.49, 0.49)  # a firing of another pixel is not this one's to place
-        step = np.float32(2 * math.pi / clear.shape[1])
-        return cls(elevation, azimuth - aside * step, turn, fired, clear)
+        sigmas = 0.5 * float(step) / jitter_rad if jitter_rad else math.inf
+        return cls(elevation, azimuth - aside * step, turn, fired, clear, math.erfc(sigmas / math.sqrt(2)))
 
     def columns(self, which: slice) -> "Beams":
         """Return the rays of some columns."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
+from lidargrit.scans.sensors import SensorSetup
 from lidargrit.simulator.beams import footprint
 from lidargrit.simulator.power import RaydropModel, Surfaces, received_power
 from lidargrit.simulator.tracing import NOTHING, Hits, Tracer
@@ -58,12 +59,14 @@ def detect_echoes(
     first: Hits,
     edge: Bool[np.ndarray, " n"],
     model: RaydropModel,
+    setup: SensorSetup,
 ) -> Echoes:
     """Find the strongest echo of every beam, given what the middle of each meets first.
 
     Where a beam meets glass, what stands behind answers too, its light taken twice by every pane. At edges the beam's
     width counts: four more rays are cast, and each carries a fifth of the light. Echoes that are closer to one
-    another than the pulse is long are heard as one, at their mean range.
+    another than the pulse is long are heard as one, at their mean range. A beam that is split between surfaces farther
+    apart loses power besides: the pulse that comes back is not the one that the sensor looks for.
 
     Args:
         tracer: ray caster of the scene.
@@ -81,13 +84,14 @@ def detect_echoes(
     origins, directions, wide = rays[0][several], rays[1][several], edge[several]
     middle = Hits(first.range_m[several], first.triangle[several], first.cos_incidence[several])
     behind, light = tracer.cast_through(origins, directions, middle, passing)
-    light[behind.triangle == middle.triangle] = 0  # no pane was there, and no second echo
-    corners = _corners(tracer, origins, directions, wide, model)
+    light[light == 1] = 0  # no pane was there, and no second echo
+    corners = _corners(tracer, origins, directions, wide, setup.divergence_mrad)
     parts = (middle, behind, *corners)
     powers = np.stack([_power(surfaces, part, model) for part in parts])
     powers[1] *= light
     powers[:, wide] *= np.float32(1 / (1 + len(corners)))
-    _answer_strongest(echoes, several, powers, parts, model.pulse_length_m)
+    split = wide & (light == 0)  # behind a pane nothing is known of the other parts
+    _answer_strongest(echoes, several, powers, parts, split, setup)
     return echoes
 
 
@@ -100,10 +104,10 @@ def _corners(
     origins_m: Float32[np.ndarray, "n 3"],
     directions: Float32[np.ndarray, "n 3"],
     wide: Bool[np.ndarray, " n"],
-    model: RaydropModel,
+    divergence_mrad: float,
 ) -> list[Hits]:
     """Cast the four corners of those beams whose width counts; the others' meet nothing."""
-    corners = footprint(directions[wide], model.divergence_mrad / 1e3)
+    corners = footprint(directions[wide], divergence_mrad / 1e3)
     found = tracer.cast(np.concatenate([origins_m[wide]] * len(corners)), corners.reshape(-1, 3))
     hits = []
     for part in range(len(corners)):
@@ -124,21 +128,32 @@ def _answer_strongest(
     several: Int64[np.ndarray, " n"],
     powers: Float32[np.ndarray, "parts n"],
     parts: tuple[Hits, ...],
-    pulse_length_m: float,
+    split: Bool[np.ndarray, " n"],
+    setup: SensorSetup,
 ) -> None:
-    """Write into echoes, for the beams that have several, the strongest group of those a pulse's length apart."""
+    """Write into echoes, for the beams that have several, the strongest group of those a pulse's length apart.
+
+    Args:
+        parts: hits of the middle, of what is behind a pane, and of the corners.
+        split: True for beams whose parts on other surfaces weaken the group.
+    """
     range_m = np.minimum(np.stack([part.range_m for part in parts]), np.float32(_FAR_M))
     beam = np.arange(len(several))
     best, group = np.full(len(several), -1, np.float32), powers
+    heard_parts = np.zeros(range_m.shape, bool)
     for one in range_m:  # its group: those that are heard together with it
-        together = np.where(np.abs(range_m - one) < np.float32(pulse_length_m), powers, np.float32(0))
+        near = np.abs(range_m - one) < np.float32(setup.pulse_length_m)
+        together = np.where(near, powers, np.float32(0))
         total = together.sum(axis=0)
         group = np.where(total > best, together, group)
+        heard_parts = np.where(total > best, near, heard_parts)
         best = np.maximum(best, total)
     heard = best > 0
     member = group.argmax(axis=0)
     mean_m = (group * range_m).sum(axis=0) / np.where(heard, best, 1)
-    echoes.power[several] = best
+    of_beam = (range_m < _FAR_M) & (np.arange(len(range_m)) != 1)[:, None]  # what is behind a pane is no part of it
+    share = (of_beam & heard_parts).sum(axis=0) / np.maximum(of_beam.sum(axis=0), 1)
+    echoes.power[several] = np.where(split, best * share.astype(np.float32) ** np.float32(setup.split_exponent), best)
     # Where nothing answers, the middle of the beam still says what stands there.
     echoes.range_m[several] = np.where(heard, mean_m, echoes.range_m[several])
     for name in ("triangle", "cos_incidence"):

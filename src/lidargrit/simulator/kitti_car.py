@@ -1,4 +1,4 @@
-"""Facts about the car that recorded KITTI: which rays end on the car, and the gains of its lasers."""
+"""Facts about the car that recorded KITTI: which rays end on it."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -37,25 +37,6 @@ _HIDDEN_DEG = (
               (130, 146), (152, 213))),
     (-23.64, ((-144, -126), (-89, -88), (-82, -76), (-40, -28), (-20, 20), (25, 30), (31, 38), (125, 213))),
 )
-# fmt: on
-
-# Fitted by benchmarks/fit_raydrop.py to the shares of returns and the reflectances of the rows of the same scans, in
-# simulated streets; a row is a laser, from the top. The weak ones, such as rows 36, 42 and 51, read dark on any road.
-# fmt: off
-LASER_GAINS = (
-    0.1, 0.3, -0.5, -0.5, -0.7, 0.1, 0.0, 0.1, 0.3, -0.2, 0.3, 0.6, 0.5, 0.3, 0.2, -0.3,
-    0.3, 0.3, 0.6, 0.1, 0.8, -0.7, 0.5, 0.7, -0.1, 0.2, 0.4, 0.3, 0.1, -0.5, 0.0, -0.1,
-    0.5, -0.4, 0.0, -1.4, -1.6, -0.5, 0.2, -0.7, -0.8, -0.5, -1.8, -0.8, -0.9, -0.9, -1.0, -1.3,
-    -1.6, -1.1, -1.2, -2.4, -1.3, -1.8, -2.1, -1.4, -1.4, -1.6, -2.2, -2.2, -2.4, -1.7, -1.8, -1.9,
-)
-"""Natural logarithm of each laser's gain in power."""
-LASER_READINGS = (
-    1.0, 1.0, 0.9, 0.85, 1.0, 0.85, 1.0, 0.95, 1.0, 0.85, 1.0, 1.0, 1.1, 1.0, 1.0, 1.0,
-    1.0, 1.0, 1.0, 0.95, 1.0, 0.75, 1.0, 1.0, 0.95, 0.95, 1.0, 1.0, 1.0, 0.85, 1.0, 1.0,
-    1.0, 0.95, 0.95, 0.75, 0.75, 0.95, 1.1, 1.0, 0.85, 0.95, 0.75, 0.95, 0.95, 0.95, 0.95, 0.85,
-    0.8, 0.95, 1.0, 0.6, 0.95, 0.75, 0.75, 0.95, 0.95, 1.0, 0.75, 0.75, 0.75, 0.95, 1.05, 1.0,
-)
-"""Factor of the reflectance that each laser reports."""
 # fmt: on
 
 

@@ -8,33 +8,40 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int32, UInt16
 
 from lidargrit.scans.marks import mark
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, SensorSetup
 from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.echoes import Echoes, detect_echoes, edges
-from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.mesh import Finish, Mesh, Objects
 from lidargrit.simulator.power import (
     BeamNoise,
     Lasers,
     RaydropModel,
     Surfaces,
     levels,
+    range_sigma_m,
     reflectance,
     return_probability,
 )
-from lidargrit.simulator.tracing import Tracer, in_reach
+from lidargrit.simulator.setups import setup_of
+from lidargrit.simulator.tracing import Tracer, in_reach, objects_in_reach
 
 
 @runtime_checkable
 class ObservableScene(Protocol):
     """Interface of a scene that a sensor can observe."""
 
-    def mesh(self, time_s: float = 0.0) -> Mesh:
-        """Return the triangles at a time, in seconds."""
+    @property
+    def standing(self) -> Mesh:
+        """Triangles of all that is no kept object."""
         ...
 
-    def sensor_pose(self, time_s: float = 0.0) -> Float64[np.ndarray, "4 4"]:
-        """Return the sensor's frame in the scene's at a time."""
+    def objects(self, time_s: float = 0.0) -> Objects:
+        """Return the kept objects at a time, in seconds."""
+        ...
+
+    def sensor_pose(self, time_s: float = 0.0, height_m: float = 1.73) -> Float64[np.ndarray, "4 4"]:
+        """Return the frame in the scene's, at a time, of a sensor of some height above the road."""
         ...
 
 
@@ -142,14 +149,15 @@ def observe_scene(
 
     Args:
         scene: triangles and sensor poses.
-        scene_rng: source of what stays the same from one revolution to the next: the gain of every object.
+        scene_rng: source of what stays the same from one revolution to the next: the gain of every object, and the
+            set-up of a sensor of which there are no scans.
         beam_rng: source of what differs from one revolution to the next.
         config: time, motion, wetness and raydrop model.
     """
-    model = config.model
-    begun, ended = (scene.sensor_pose(config.time_s + after_s) for after_s in (0.0, REVOLUTION_S))
+    model, setup = config.model, setup_of(sensor, scene_rng)
+    begun, ended = (scene.sensor_pose(config.time_s + after_s, setup.height_m) for after_s in (0.0, REVOLUTION_S))
     poses = (begun, ended) if config.motion else (begun,)
-    beams = Beams.sample(sensor, beam_rng, model.gap_share)
+    beams = Beams.sample(sensor, beam_rng, setup.firing_jitter_rad)
     height, fine_width = beams.azimuth_rad.shape
     beam_noise = BeamNoise.sample(beam_rng, height, fine_width, model)
     stride = fine_width // sensor.width if config.kept_columns_only else 1
@@ -157,8 +165,12 @@ def observe_scene(
     looked, beam_noise = beams.columns(kept), beam_noise.columns(kept)
 
     elevations_rad = float(beams.elevation_rad.min()), float(beams.elevation_rad.max())
-    mesh = in_reach(scene.mesh(config.time_s), poses, elevations_rad, sensor.range_max_m)
-    tracer, surfaces = Tracer(mesh, sensor.range_max_m), Surfaces.of(mesh, model, config.wet)
+    # A drive keeps the tree of all that stands over its frames; for a single scan, one of what is in reach is enough.
+    drives = config.time_s > 0
+    mesh = scene.standing if drives else in_reach(scene.standing, poses, elevations_rad, sensor.range_max_m)
+    objects = objects_in_reach(scene.objects(config.time_s), poses, sensor.range_max_m)
+    finish = Finish.join([mesh.finish(), objects.finish()])
+    tracer, surfaces = Tracer(mesh, sensor.range_max_m, objects), Surfaces.of(finish, model, setup, config.wet)
     rays = looked.rays(*poses)
     first = tracer.cast(*rays)
     range_m = first.range_m.reshape(looked.azimuth_rad.shape)
@@ -167,10 +179,9 @@ def observe_scene(
     else:
         beside = _beside(tracer, beams, poses, stride)
     edge = edges(range_m, *beside, model.edge_share).ravel()
-    echoes = detect_echoes(tracer, surfaces, rays, first, edge, model)
-    limits_m = sensor.range_min_m, sensor.range_max_m
-    lasers = Lasers.of(sensor, model)
-    seen = _measure(mesh, surfaces, echoes, looked, lasers, beam_noise, scene_rng, limits_m, begun, model)
+    echoes = detect_echoes(tracer, surfaces, rays, first, edge, model, setup)
+    limits_m = sensor.range_min_m, min(setup.farthest_m or sensor.range_max_m, sensor.range_max_m)
+    seen = _measure(finish, surfaces, echoes, looked, setup, beam_noise, scene_rng, limits_m, begun, model)
     fired_s = np.broadcast_to(looked.turn * np.float32(REVOLUTION_S), seen.range_m.shape)
     return replace(seen, fired_s=fired_s) if config.motion else seen
 
@@ -189,19 +200,19 @@ def _beside(
     return np.roll(found[0], 1, axis=1), found[1]
 
 
-def _object_gains(mesh: Mesh, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
+def _object_gains(finish: Finish, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
     """Sample the natural log of the gain of every object by its number; what is no single object has none."""
-    gains = rng.standard_normal(int(mesh.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
+    gains = rng.standard_normal(int(finish.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
     gains[0] = 0
     return gains
 
 
 def _measure(
-    mesh: Mesh,
+    finish: Finish,
     surfaces: Surfaces,
     echoes: Echoes,
     beams: Beams,
-    lasers: Lasers,
+    setup: SensorSetup,
     beam_noise: BeamNoise,
     scene_rng: np.random.Generator,
     limits_m: tuple[float, float],
@@ -209,16 +220,17 @@ def _measure(
     model: RaydropModel,
 ) -> Observation:
     """Decide by chance which echoes are noticed, and what is read from them."""
-    shape = beams.azimuth_rad.shape
-    label = np.append(mesh.label, np.uint16(0))[echoes.triangle]
-    instance = np.append(mesh.instance, np.int32(0))[echoes.triangle]
-    of_object = _object_gains(mesh, scene_rng, model)[instance]
+    shape, lasers = beams.azimuth_rad.shape, Lasers.of(setup, len(beams.azimuth_rad))
+    label = np.append(finish.label, np.uint16(0))[echoes.triangle]
+    instance = np.append(finish.instance, np.int32(0))[echoes.triangle]
+    of_object = _object_gains(finish, scene_rng, model)[instance]
     log_gain = (lasers.log_gain + beam_noise.patch).ravel() + of_object
     level = levels(echoes.power, log_gain, model)
     clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])
-    probability = np.where(clear, return_probability(level, model), np.float32(0))
+    probability = np.where(clear, return_probability(level, model, beams.gap_share), np.float32(0))
     pulse_noise = np.float32(model.pulse_spread) * beam_noise.pulse.ravel()
-    range_m = echoes.range_m + np.float32(model.range_sigma_m) * beam_noise.range_noise.ravel()
+    sigma_m = range_sigma_m(np.minimum(echoes.range_m, limits_m[1]), echoes.cos_incidence, setup).reshape(shape)
+    range_m = echoes.range_m + (lasers.offset_m + sigma_m * beam_noise.range_noise).ravel()
     came_back = clear & beams.fired.ravel() & (level + pulse_noise > 0)
     came_back &= (range_m >= limits_m[0]) & (range_m <= limits_m[1])
     specular = surfaces.specular(echoes.triangle, echoes.cos_incidence)
@@ -227,7 +239,7 @@ def _measure(
     scattered = (scattered.reshape(shape) * lasers.reading).ravel()
     # The very pulse that comes back stronger reads brighter.
     chance = beam_noise.pulse.ravel() * surfaces.mottle[surfaces.material[echoes.triangle]]
-    bright = reflectance(scattered, specular, level + pulse_noise, chance, model)
+    bright = reflectance(scattered, specular, level + pulse_noise, chance, model, setup.reflectance_scale)
     return Observation(
         clean_range_m=np.where(np.isinf(echoes.range_m), np.float32(0), echoes.range_m).reshape(shape),
         return_probability=probability.reshape(shape),

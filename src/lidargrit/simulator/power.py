@@ -7,18 +7,19 @@ from jaxtyping import Float32, Int32, UInt8
 from scipy.special import ndtr
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.scans.sensors import SensorModel
-from lidargrit.simulator.kitti_car import LASER_GAINS, LASER_READINGS, is_on_car
-from lidargrit.simulator.materials import ASPHALT, CONCRETE, MATERIALS, Material
-from lidargrit.simulator.mesh import Mesh
+from lidargrit.scans.sensors import SensorSetup
+from lidargrit.simulator.materials import ASPHALT, CONCRETE, GLASS, MATERIALS, Material
+from lidargrit.simulator.mesh import Finish
 
 _PATCH_AT_LEAST_DEG = 0.01  # finer than any sensor's columns; every patch of a ring takes memory
-_EVEN_RAD = 1e-4  # by which equal steps may differ, because of rounding; those of lasers differ by far more
+_INCIDENCE_AT_LEAST = 0.05  # cosine: beyond 87 degrees a beam's footprint ends with the surface
 
 
 @dataclass(frozen=True)
 class RaydropModel:
-    """Parameters of which beams return and what is measured; the defaults suit the HDL-64E of KITTI.
+    """Parameters of which beams return and what is measured, alike for all sensors; the defaults suit KITTI's HDL-64E.
+
+    What differs from unit to unit is in :class:`.SensorSetup`.
 
     Powers are in units of what a white plate at 1 m would send back, were the receiver in focus there. "Fitted" numbers
     bring simulated scans nearest to 67 scans of KITTI, all together: ``benchmarks/fit_raydrop.py`` finds them, and
@@ -32,20 +33,11 @@ class RaydropModel:
             about 0.006, by Koschmieder's rule, 3 / visibility.
         gloss: factor on the gloss of all materials.
         retroreflection: factor on the retroreflection of all materials.
-        laser_gains: natural logarithm of the gain of each laser of KITTI's HDL-64E, from the top. Fitted, to its share
-            of returns and its reflectance.
-        laser_readings: factor on the reflectance that each of these lasers reports. Fitted to the same.
-        laser_spread: spread of the log gains of other sensors' lasers, sampled once for a sensor. KITTI's lasers differ
-            as much.
         patch_spread: spread of the log gain along a ring. Fitted.
         patch_deg: angle along a ring over which that gain is correlated. Fitted.
         object_spread: spread of the log gain from object to object. Fitted.
         pulse_spread: spread of the log gain from pulse to pulse. Fitted.
-        gap_share: share of pixels without a firing. Measured: 2.9 to 3.5 % of four unfolded KITTI scans.
-        divergence_mrad: full angle of a beam. Velodyne's HDL-64E S2 data sheet: 2 mrad.
-        pulse_length_m: distance below which two echoes merge. The same data sheet: pulses of 5 ns, so c t / 2.
         edge_share: relative bend of inverse range above which a pixel counts as an edge; a plane has no bend.
-        range_sigma_m: standard deviation of the range noise. HDL-64E S2 data sheet: accuracy below 2 cm, one sigma.
         dim_level: log of power over ``least_power`` below which reflectance reads 0. Fitted.
         dim_share: share of its reflectance that an echo just above that level reads; KITTI has few readings in
             (0, 0.05). Fitted.
@@ -63,18 +55,11 @@ class RaydropModel:
     extinction_per_m: float = 0.0
     gloss: float = 1.0
     retroreflection: float = 1.0
-    laser_gains: tuple[float, ...] = LASER_GAINS
-    laser_readings: tuple[float, ...] = LASER_READINGS
-    laser_spread: float = 0.31
     patch_spread: float = 0.141
     patch_deg: float = 4.82
     object_spread: float = 0.522
     pulse_spread: float = 0.424
-    gap_share: float = 0.033
-    divergence_mrad: float = 2.0
-    pulse_length_m: float = 0.75
     edge_share: float = 0.05
-    range_sigma_m: float = 0.02
     dim_level: float = 2.67
     dim_share: float = 0.175
     bright_level: float = 3.1
@@ -84,7 +69,6 @@ class RaydropModel:
     materials: tuple[Material, ...] = MATERIALS
 
     def __post_init__(self) -> None:
-        gains, readings = len(self.laser_gains), len(self.laser_readings)
         for fits, got, wanted in (
             (self.least_power > 0, f"least_power={self.least_power:g}", "a power above 0"),
             (
@@ -92,8 +76,6 @@ class RaydropModel:
                 f"patch_deg={self.patch_deg:g}",
                 f"{_PATCH_AT_LEAST_DEG:g} or more",
             ),
-            (0 <= self.gap_share < 1, f"gap_share={self.gap_share:g}", "a share from 0 to less than 1"),
-            (gains == readings, f"{gains} laser_gains and {readings} laser_readings", "one of each for every laser"),
         ):
             if not fits:  # also for NaN
                 raise ConfigError(got, wanted, "correct the raydrop model")
@@ -122,10 +104,10 @@ class Surfaces:
     mottle: Float32[np.ndarray, " m"]
 
     @classmethod
-    def of(cls, mesh: Mesh, model: RaydropModel, wet: float = 0.0) -> "Surfaces":
+    def of(cls, finish: Finish, model: RaydropModel, setup: SensorSetup, wet: float = 0.0) -> "Surfaces":
         """Look up the materials of a mesh, on ground between dry (``wet`` 0) and soaked (1)."""
-        albedo = np.append(mesh.albedo, np.float32(0))
-        material = np.append(mesh.material, np.uint8(len(model.materials)))
+        albedo = np.append(finish.albedo, np.float32(0))
+        material = np.append(finish.material, np.uint8(len(model.materials)))
         nothing = Material("nothing")
         diffuse, gloss, lobe_power, retro, passes, mottle = (
             np.array([getattr(m, name) for m in (*model.materials, nothing)], np.float32)
@@ -137,6 +119,7 @@ class Surfaces:
             albedo[(material == ASPHALT) | (material == CONCRETE)] *= np.float32(1 - wet * model.wet_darkening)
             gloss[[ASPHALT, CONCRETE]] = wet * model.wet_gloss
             lobe_power[[ASPHALT, CONCRETE]] = 100  # a film on rough ground: a narrow lobe, a third at 8 degrees
+        passes[GLASS] = setup.glass_passes
         mottle = np.hypot(mottle, np.float32(model.reflectance_spread))
         return cls(albedo, material, gloss, lobe_power, retro, passes, mottle)
 
@@ -183,29 +166,39 @@ def received_power(
 
 @dataclass(frozen=True, eq=False)
 class Lasers:
-    """Differences between the lasers of one sensor, row by row; they are the same in all scans.
+    """Differences between the lasers of one unit, row by row; they are the same in all scans.
 
     Args:
         log_gain: natural log of each laser's gain.
         reading: factor on the reflectance that each laser reports.
+        offset_m: constant error of each laser's ranges, in metres.
     """
 
     log_gain: Float32[np.ndarray, "H 1"]
     reading: Float32[np.ndarray, "H 1"]
+    offset_m: Float32[np.ndarray, "H 1"]
 
     @classmethod
-    def of(cls, sensor: SensorModel, model: RaydropModel) -> "Lasers":
-        """Look up the lasers of KITTI's own sensor, or sample those of another."""
-        if is_on_car(sensor) and _rows_are_lasers(sensor, len(model.laser_gains)):
-            return cls(*(np.array(t, np.float32)[:, None] for t in (model.laser_gains, model.laser_readings)))
-        gains = np.random.default_rng(64).normal(0, model.laser_spread, (sensor.height, 1)).astype(np.float32)
-        return cls(gains, np.ones_like(gains))
+    def of(cls, setup: SensorSetup, height: int) -> "Lasers":
+        """Look up the lasers of a set-up; where it has none, all are alike."""
+        lists = ((setup.log_gain, 0.0), (setup.reading, 1.0), (setup.offset_m, 0.0))
+        return cls(*(np.array(each or (alike,) * height, np.float32)[:, None] for each, alike in lists))
 
 
-def _rows_are_lasers(sensor: SensorModel, count: int) -> bool:
-    """Return whether each row is a laser: of rows in equal steps, as in KITTI-360's images, several meet in one."""
-    steps_rad = sensor.elevation_rad.diff(dim=0)
-    return sensor.height == count and float(steps_rad.max() - steps_rad.min()) > _EVEN_RAD
+def range_sigma_m(
+    range_m: Float32[np.ndarray, "*shape"], cos_incidence: Float32[np.ndarray, "*shape"], setup: SensorSetup
+) -> Float32[np.ndarray, "*shape"]:
+    """Return the standard deviation of the range noise, in metres.
+
+    A beam of finite width meets a surface that is struck at an angle at many ranges: the footprint's depth is its
+    width times the tangent of incidence.
+    """
+    cos = np.maximum(cos_incidence, np.float32(_INCIDENCE_AT_LEAST))
+    depth_m = range_m * np.float32(setup.divergence_mrad / 1e3) * np.sqrt(1 - cos * cos) / cos
+    far_m = np.float32(setup.range_sigma_per_m) * range_m
+    return np.sqrt(
+        np.float32(setup.range_sigma_m**2) + far_m * far_m + (np.float32(setup.footprint_sigma) * depth_m) ** 2
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,14 +244,19 @@ def levels(
         return np.log(power * np.float32(1 / model.least_power)) + log_gain
 
 
-def return_probability(level: Float32[np.ndarray, "*shape"], model: RaydropModel) -> Float32[np.ndarray, "*shape"]:
+def return_probability(
+    level: Float32[np.ndarray, "*shape"], model: RaydropModel, gap_share: float
+) -> Float32[np.ndarray, "*shape"]:
     """Return the probability that a pulse is fired into the pixel and, with its own chance, exceeds the least power.
 
     The factor from pulse to pulse is log-normal, so this is the normal distribution function of the level.
+
+    Args:
+        gap_share: share of pixels without a pulse.
     """
     if model.pulse_spread == 0:
-        return (level > 0).astype(np.float32) * np.float32(1 - model.gap_share)
-    return ndtr(level * np.float32(1 / model.pulse_spread)) * np.float32(1 - model.gap_share)
+        return (level > 0).astype(np.float32) * np.float32(1 - gap_share)
+    return ndtr(level * np.float32(1 / model.pulse_spread)) * np.float32(1 - gap_share)
 
 
 def reflectance(
@@ -267,8 +265,9 @@ def reflectance(
     level: Float32[np.ndarray, "*shape"],
     chance: Float32[np.ndarray, "*shape"],
     model: RaydropModel,
+    scale: float = 1.0,
 ) -> Float32[np.ndarray, "*shape"]:
-    """Return what the sensor reports as reflectance: hundredths in [0, 0.99].
+    """Return what the sensor reports as reflectance: hundredths in [0, 0.99], or finer where its scale is below 1.
 
     A sensor undoes range and incidence from the strength of the echo, but a weak echo reads too dark: KITTI's road
     reads alike up to 17 m and falls to 0 at 30 m, though it is seen to 55 m.
@@ -278,8 +277,9 @@ def reflectance(
         specular: light that the surface sends back besides, by gloss and retroreflection.
         level: natural log of power over the least power.
         chance: relative error of this reading.
+        scale: factor by which this sensor's maker scales reflectances.
     """
-    full = scattered * (1 + chance) + np.float32(0.5) * specular
+    full = np.float32(scale) * (scattered * (1 + chance) + np.float32(0.5) * specular)
     seen = (level - np.float32(model.dim_level)) * np.float32(1 / (model.bright_level - model.dim_level))
     dimmed = np.where(seen > 0, model.dim_share + (1 - model.dim_share) * np.minimum(seen, 1), 0).astype(np.float32)
-    return np.round(np.clip(full * dimmed, 0, 0.99), 2)
+    return np.round(np.clip(full * dimmed, 0, 0.99), 2 if scale >= 1 else 3)

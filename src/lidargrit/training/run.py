@@ -188,6 +188,7 @@ def _claim(folder: Path, preset: Preset, train_images: RangeImages, val_images: 
     about: dict[str, Any] = {
         "preset": configuration.to_json(preset),
         "data": data,
+        "streets": list(train_images.provenance.streets),
         **({"taken": taken_facts(preset)} if preset.start_runs else {}),
         "command": sys.argv,
         "lidargrit": __version__,

@@ -10,7 +10,7 @@ from torch import Tensor
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json
-from lidargrit.data.run_folder import CHECKPOINT_FILE, RUN_FILE, locate, taken_over
+from lidargrit.data.run_folder import CHECKPOINT_FILE, RUN_FILE, is_run, locate, named_folder, taken_over
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
@@ -57,10 +57,11 @@ def taken_stages(preset: Preset, generator: Generator) -> dict[str, Objective]:
         # Of a tokenizer :func:`_check` tells the kind.
         alike = name in donor.stages and (name == "tokenizer" or type(donor.objective(name)) is type(ours.objective))
         if not alike:
+            in_bundle = is_run(named_folder(run) / name)
             raise ConfigError(
                 f"{setting}, a run of the generator {donor.public_name()!r}",
                 f"a run of {generator.public_name()!r}, or of another with the same stage {name!r}",
-                "choose another run",
+                f"set training.{name}.start={run}/{name}" if in_bundle else "choose another run",
             )
         theirs = _Stage(name, donor)
         _check(setting, ours, theirs, trained=not config.frozen)

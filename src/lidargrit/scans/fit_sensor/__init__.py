@@ -16,6 +16,7 @@ from lidargrit.scans.fit_sensor.azimuths import columns_of_scans, firing_steps_d
 from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, nearest_row, rows_of_rings
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
+from lidargrit.scans.fit_sensor.setup import fit_setup
 from lidargrit.scans.many_scans import ManyScans, usable_scans
 from lidargrit.scans.projection.frame import told_height
 from lidargrit.scans.projection.pixel_coordinates import row_elevation_rad
@@ -127,7 +128,7 @@ class SensorFit:
 
 
 def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
-    """Find the sensor that made scans: its rows, columns, limits, and how it turns.
+    """Find the sensor that made scans: its rows, columns, limits, how it turns, and the set-up of its unit.
 
     Args:
         scans: scans of one sensor in its own frame, best five or more from different places.
@@ -162,6 +163,9 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     steps = firing_steps_deg(used, row_of_point)
     columns = columns_of_scans(used, row_of_point, steps)
     sensor = _model(name, rows, columns, used, row_of_point, rings, len(used))
+    setup, assumed = fit_setup([scans[index] for index in rings.used], sensor)
+    sensor = replace(sensor, setup=setup)
+    doubts = (*notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns), *assumed)
     return SensorFit(
         sensor=sensor,
         method=rings.method,
@@ -178,7 +182,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
         row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
-        warnings=(*_notes_of(scans), *notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns)),
+        warnings=(*_notes_of(scans), *doubts),
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from lidargrit.core.table import Table
 from lidargrit.scans.fit_sensor import SensorFit
+from lidargrit.scans.sensors import SensorSetup
 
 _ROWS_SHOWN = 8  # spread over the sensor; the file and the picture have all
 
@@ -24,6 +25,7 @@ def as_table(fit: SensorFit) -> str:
         "range": f"{sensor.range_min_m:g} to {sensor.range_max_m:g} m"
         + (f", {of_what} in steps of {step_m:g} m" if step_m else ""),
         "lasers": _lasers(fit),
+        "unit": _unit(sensor.setup),
         "projection": sensor.projection,
         "agreement": f"{fit.agree_share:.1%} of the points lie close to their ring's elevation",
     }
@@ -59,6 +61,19 @@ def as_json(fit: SensorFit) -> dict[str, Any]:
         "points_per_ring": fit.points_per_ring.tolist(),
         "warnings": list(fit.warnings),
     }
+
+
+def _unit(setup: SensorSetup | None) -> str:
+    """Describe what planes tell of this unit."""
+    if setup is None:
+        return "too few planes to tell its noise"
+    noise_cm, growth_mm, offsets_cm = (
+        100 * setup.range_sigma_m,
+        1000 * setup.range_sigma_per_m,
+        100 * np.std(setup.offset_m),
+    )
+    noise = f"range noise {noise_cm:.1f} cm and {growth_mm:.1f} mm a metre"
+    return f"{noise}, lasers {offsets_cm:.1f} cm apart, {setup.height_m:.2f} m above the ground"
 
 
 def _lasers(fit: SensorFit) -> str:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lidargrit.core import discovery
+from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json
 from lidargrit.core.untrusted import user_path
@@ -22,6 +22,7 @@ from lidargrit.scans.sensors._checks import (
 from lidargrit.scans.sensors._checks import NAME_AT_MOST as NAME_AT_MOST
 from lidargrit.scans.sensors._checks import continuous_azimuths_rad as continuous_azimuths_rad
 from lidargrit.scans.sensors._checks import mean_azimuths_rad as mean_azimuths_rad
+from lidargrit.scans.sensors._setup import SensorSetup as SensorSetup
 
 _REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
 
@@ -48,6 +49,8 @@ class SensorModel:
             point is placed by its own azimuth, so images do not depend on it; the simulator aims by it.
         first_edge_rad: azimuth at which column 0 begins, in radians. Half a column beyond +pi, columns have their
             centres where a sensor fires at whole multiples of a column (Ouster), and no point lies on a border.
+        setup: noise, lasers and mounting of one unit, which the simulator takes. If not given, it takes that of the
+            packaged sensor of this name, or samples one.
 
     Raises:
         ConfigError: tables whose shapes do not match, angles out of bounds, rows that do not fall, or limits that are
@@ -64,8 +67,11 @@ class SensorModel:
     source: str = ""
     azimuth_offset_rad: Float[Tensor, "H"] | None = None
     first_edge_rad: float = math.pi
+    setup: SensorSetup | None = None
 
     def __post_init__(self) -> None:
+        if self.setup is not None:
+            self.setup.check_rows(self.name, len(self.elevation_rad))
         tables = self.elevation_rad, self.azimuth_rad, self.azimuth_offset_rad
         check_tables(self.name, *tables, self.column_stride, self.first_edge_rad)
         check_projection(self.name, self.projection, get_args(ProjectionName))
@@ -137,6 +143,8 @@ class SensorModel:
             data["azimuth_offset_rad"] = self.azimuth_offset_rad.tolist()
         if self.first_edge_rad != math.pi:
             data["first_edge_rad"] = self.first_edge_rad
+        if self.setup is not None:
+            data["setup"] = configuration.to_json(self.setup)
         return data
 
     @classmethod
@@ -146,7 +154,11 @@ class SensorModel:
         Raises:
             ConfigError: an entry is missing, unknown, of another type or out of its bounds.
         """
-        return cls(**checked_entries(data, get_args(ProjectionName)))
+        setup = data.get("setup") if isinstance(data, dict) else None
+        if setup is None:
+            return cls(**checked_entries(data, get_args(ProjectionName)))
+        rest = {key: value for key, value in data.items() if key != "setup"}
+        return cls(**checked_entries(rest, get_args(ProjectionName)), setup=_setup_of(setup))
 
     def same_rays(self, other: "SensorModel") -> bool:
         """Return whether two sensors look along the same rays, within a hundredth of a degree."""
@@ -156,6 +168,15 @@ class SensorModel:
         return torch.allclose(self.elevation_rad, other.elevation_rad, rtol=0, atol=tolerance) and torch.allclose(
             self.azimuth_rad, other.azimuth_rad, rtol=0, atol=tolerance
         )
+
+
+def _setup_of(data: Any) -> SensorSetup:
+    try:
+        return configuration.rebuilt(SensorSetup, data)
+    except (TypeError, ConfigError) as error:
+        got = f"the set-up of a sensor with {error.got}" if isinstance(error, ConfigError) else f"a set-up: {error}"
+        wanted = error.wanted if isinstance(error, ConfigError) else "the settings of SensorSetup"
+        raise ConfigError(got, wanted, "correct the set-up, or leave it out") from None
 
 
 def load_sensor(name: str) -> SensorModel:

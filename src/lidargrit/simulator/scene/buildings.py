@@ -7,7 +7,7 @@ from jaxtyping import Float, Int, Num
 
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
-from lidargrit.simulator.scene.shapes import MeshBuilder, boxes, owners, quads, rows_of
+from lidargrit.simulator.scene.shapes import MeshBuilder, blocks, boxes, owners, quads, rows_of
 from lidargrit.simulator.scene.street_plan import Poses, StreetPlan
 
 _SINK_M = 1.5  # walls go on below the ground, which may fall away
@@ -17,7 +17,9 @@ _WINDOWS_TO_M = 85.0  # a window farther away is hit by a beam or two
 _OCCLUDERS_TO_M = 55.0  # houses farther away hide little that is not far itself
 _HIDDEN_M = 90.0  # what houses hide is placed as if it were so far away: hardly a beam finds it
 _THROUGH_PANE = materials.MATERIALS[materials.GLASS].passes ** 2  # share of light that comes back from behind one
-_PANE, _SHUTTER, _DOOR = range(3)
+_PANE, _SHUTTER, _DOOR, _GARAGE, _GATEWAY = range(5)
+_DEEP_M = np.array([0.14, 0.05, 0.2, 0.25, 0.8])  # of each kind behind the face of the wall
+_SILLS_TO_M = 22.0  # a sill stands out by less than a beam is wide, farther away
 _CURTAINED = 0.45  # share of the panes
 
 
@@ -169,9 +171,15 @@ def _add_windows(builder: MeshBuilder, rng: np.random.Generator, houses: Houses,
     shop = (storey == 0) & (houses.storey_m[home] > 3.3) & (style[0] > 0.4)  # tall ground floors have large panes
     half_width, sill = np.where(shop, width * 0.42, half_width), np.where(shop, 0.4, sill)
     kind = np.where(chance < 0.16, _SHUTTER, _PANE)
-    door = (storey == 0) & (chance > 0.88) & ~shop
-    kind, sill = np.where(door, _DOOR, kind), np.where(door, 0.02, sill)
-    blind = chance[::-1] > 0.84  # a cell without a window
+    ground, grand = storey == 0, (width > 2.5) & (houses.length_m[home] > 6)
+    entry = rng.random(len(cell))
+    door, garage = ground & (entry < 0.13) & ~shop, ground & grand & (entry > 0.93)
+    gateway = ground & grand & (entry > 0.9) & ~garage & (houses.storey_m[home] > 2.8)
+    kind = np.select([door, garage, gateway], [_DOOR, _GARAGE, _GATEWAY], kind)
+    sill = np.where(kind >= _DOOR, 0.02, sill)
+    half_width = np.select([door, garage | gateway], [0.55, np.minimum(1.3, width * 0.44)], half_width)
+    head = np.select([door, garage | gateway], [2.15, 2.35], head)
+    blind = (chance[::-1] > 0.84) & (kind < _DOOR)  # a cell without an opening
     near = walls.away[wall] < _RELIEF_TO_M
     span = rows_of(left, left + width, low, low + height)
     shut = near & blind
@@ -181,6 +189,65 @@ def _add_windows(builder: MeshBuilder, rng: np.random.Generator, houses: Houses,
     open_, patch = np.flatnonzero(near & ~blind), np.flatnonzero(~near & ~blind)
     _add_cells(builder, rng, houses, walls, wall[open_], span[open_], hole[open_], kind[open_])
     _add_patches(builder, rng, houses, walls, wall[patch], hole[patch], kind[patch])
+    low_cells = np.flatnonzero(near & ground)
+    _add_foot(builder, rng, houses, walls, wall[low_cells], span[low_cells], hole[low_cells], kind[low_cells])
+    ledge = np.flatnonzero(near & ~blind & (kind < _DOOR) & (walls.away[wall] < _SILLS_TO_M))
+    sills = hole[ledge][:, [0, 1, 2, 2]] + np.array([-0.08, 0.08, -0.06, 0.0])
+    _add_wall_blocks(builder, houses, walls, wall[ledge], sills, 0.08, materials.CONCRETE, 0.35)
+
+
+def _add_wall_blocks(
+    builder: MeshBuilder, houses: Houses, walls: _Walls, which: np.ndarray, spans: np.ndarray,
+    out_m: float | np.ndarray, material: int | np.ndarray, albedo: float | np.ndarray,
+) -> None:  # fmt: skip
+    """Add blocks that stand out of walls; spans has the columns from, to, bottom, top."""
+    along, z = spans[:, [0, 0, 0, 0, 1, 1, 1, 1]], spans[:, [2, 3, 2, 3, 2, 3, 2, 3]]
+    outer = np.broadcast_to(-np.asarray(out_m, float).reshape(-1, 1), (len(spans), 1))
+    deep = np.where(np.array([1, 1, 0, 0, 1, 1, 0, 0], bool), outer, 0.02)
+    made, bright = (np.asarray(value).reshape(-1, 1) for value in (material, albedo))
+    builder.add(blocks(_on_wall(houses, walls, which, along, deep, z)), made, bright, classes.BUILDING)
+
+
+def _add_foot(
+    builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls, wall: np.ndarray, span: np.ndarray,
+    hole: np.ndarray, kind: np.ndarray,
+) -> None:  # fmt: skip
+    """Add what a low sensor sees of walls: plinths with cellar windows, steps before doors, downpipes, a ledge above.
+
+    The uppermost beam of an HDL-64E rises by 2 degrees: of a wall 20 m away it sees 2.4 m.
+    """
+    count = len(houses.length_m)
+    tall, out = rng.uniform(0.25, 0.95, count), rng.uniform(0.02, 0.07, count)
+    stone, bright = rng.choice([materials.CONCRETE, materials.BRICK], count), rng.uniform(0.2, 0.45, count)
+    based = rng.random(count) < 0.65
+    home = walls.house[wall]
+    closed = np.flatnonzero(based[home] & (kind < _DOOR))
+    cellar = closed[(rng.random(len(closed)) < 0.35) & (tall[home[closed]] > 0.5)]
+    whole = np.setdiff1d(closed, cellar)
+    middle, high = span[:, :2].mean(axis=1), tall[home]
+    left, right, lintel = middle - 0.4, middle + 0.4, high - 0.12
+    parts = [(whole, span[:, 0], span[:, 1], -0.3, high), (cellar, span[:, 0], left, -0.3, high),
+             (cellar, right, span[:, 1], -0.3, high), (cellar, left, right, -0.3, 0.12),
+             (cellar, left, right, lintel, high)]  # fmt: skip
+    for some, *edges in parts:
+        spans = np.column_stack([np.broadcast_to(edge, len(span)) for edge in edges])[some]
+        house = home[some]
+        _add_wall_blocks(builder, houses, walls, wall[some], spans, out[house], stone[house], bright[house])
+    dark = rows_of(left, right, 0.12, lintel)[cellar]
+    _add_wall_blocks(builder, houses, walls, wall[cellar], dark, 0.004, materials.PLASTER, 0.06)
+    doors = np.flatnonzero((kind == _DOOR) & (rng.random(len(kind)) < 0.7))
+    for level, reach in ((0.17, rng.uniform(0.3, 1.0, len(doors))), (0.34, rng.uniform(0.25, 0.3, len(doors)))):
+        step = np.column_stack((hole[doors, :2] + np.array([-0.25, 0.25]), np.full((len(doors), 2), [-_SINK_M, level])))
+        _add_wall_blocks(builder, houses, walls, wall[doors], step, reach, materials.CONCRETE, 0.3)
+    once = np.unique(wall)
+    piped = once[rng.random(len(once)) < 0.7]
+    at = np.where(rng.random(len(piped)) < 0.5, 0.12, walls.length[piped] - 0.22)
+    pipes = rows_of(at, at + 0.1, -0.2, houses.height_m[walls.house[piped]])
+    _add_wall_blocks(builder, houses, walls, piped, pipes, 0.13, materials.METAL, 0.25)
+    banded = once[(rng.random(count) < 0.25)[walls.house[once]]]
+    storey = houses.storey_m[walls.house[banded]]
+    band = rows_of(0.0, walls.length[banded], storey - 0.15, storey + 0.1)
+    _add_wall_blocks(builder, houses, walls, banded, band, 0.1, materials.CONCRETE, 0.4)
 
 
 def _add_patches(
@@ -192,7 +259,7 @@ def _add_patches(
     points = _on_wall(houses, walls, wall, along, np.full(along.shape, -0.03), z)
     room = np.where(rng.random(len(kind)) < _CURTAINED, rng.uniform(0.25, 0.6, len(kind)), 0.09)
     bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(0.15, 0.55, len(kind)))
-    material = np.where(kind == _DOOR, materials.PAINT, materials.PLASTER)
+    material = np.where(np.isin(kind, (_DOOR, _GARAGE)), materials.PAINT, materials.PLASTER)
     builder.add(quads(points), material[:, None], bright[:, None], classes.BUILDING)
 
 
@@ -214,14 +281,14 @@ def _add_cells(
     ]
     _add_wall_quads(builder, houses, walls, np.tile(wall, 4), np.concatenate(frame))
     house = walls.house[wall]
-    deep = np.where(kind == _SHUTTER, 0.05, 0.14)[:, None]
+    deep = _DEEP_M[kind][:, None]
     along, z = hole[:, [0, 1, 1, 0]], hole[:, [2, 2, 3, 3]]
     outer, inner = (_on_wall(houses, walls, wall, along, np.broadcast_to(d, along.shape), z) for d in (deep * 0, deep))
     reveal = np.stack((outer, np.roll(outer, -1, 1), np.roll(inner, -1, 1), inner), axis=2)
     material, albedo = houses.wall_material[house][:, None, None], houses.wall_albedo[house][:, None, None]
     builder.add(quads(reveal), material, albedo, classes.BUILDING)
-    filling = np.array([materials.GLASS, materials.PLASTER, materials.PAINT])[kind]
-    bright = np.where(kind == _PANE, 0.02, rng.uniform(0.15, 0.55, len(kind)))
+    filling = np.array([materials.GLASS, materials.PLASTER, *(materials.PAINT,) * 2, materials.PLASTER])[kind]
+    bright = np.where(kind == _PANE, 0.02, np.where(kind == _GATEWAY, 0.05, rng.uniform(0.15, 0.55, len(kind))))
     builder.add(quads(inner), filling[:, None], bright[:, None], classes.BUILDING)
     curtain = np.flatnonzero((kind == _PANE) & (rng.random(len(kind)) < _CURTAINED))  # cloth close behind the pane
     along, z = along[curtain], z[curtain]
@@ -266,7 +333,7 @@ def _add_roofs(builder: MeshBuilder, rng: np.random.Generator, houses: Houses) -
 
 
 def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: Houses, walls: _Walls) -> None:
-    """Hang balconies on some fronts, put steps before some doors, and add bays that break the plane."""
+    """Hang balconies on some fronts, and add bays that break the plane."""
     count = len(houses.length_m)
     front = (walls.glazed & (walls.away < _BALCONIES_TO_M))[:count]
     many = np.where(front, rng.poisson(1.6, count), 0)
@@ -285,9 +352,6 @@ def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: House
     builder.add(
         houses.poses.of(home[hung]).to_world(balcony), materials.CONCRETE, albedo[hung][:, None, None], classes.BUILDING
     )
-    steps = np.flatnonzero(kind > 0.75)
-    step = boxes(rows_of(x - half, face - out, -_SINK_M), rows_of(x + half, face, 0.15 + 0.5 * kind))[steps]
-    builder.add(houses.poses.of(home[steps]).to_world(step), materials.CONCRETE, 0.3, classes.BUILDING)
     bays = np.flatnonzero((kind > 0.5) & (kind < 0.75))
     tall = houses.height_m[home] * np.where(half > 1.2, 1.0, 0.45)
     bay = boxes(rows_of(x - half, face - out * 0.6, -_SINK_M), rows_of(x + half, face + 0.05, tall))[bays]

@@ -2,33 +2,44 @@
 
 import numpy as np
 
-from lidargrit.simulator.scene import plants, street_furniture
+from lidargrit.simulator.scene import barriers, furniture
+from lidargrit.simulator.scene.body_types import HATCHBACK
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.people import make_cyclists, make_walkers
+from lidargrit.simulator.scene.plants import make_bushes, make_hedges, make_trees
 from lidargrit.simulator.scene.settlement import Settlement, free_spans
 from lidargrit.simulator.scene.shapes import MeshBuilder, rows_of
 from lidargrit.simulator.scene.street_plan import StreetPlan
-from lidargrit.simulator.scene.vehicles import HATCHBACK, make_vehicles, sample_vehicle_kinds
+from lidargrit.simulator.scene.vehicles import make_vehicles, sample_vehicle_kinds
 
 _OUR_LENGTH_M = 9.0  # from the middle of our car to that of the next in our lane, at least
 _PARKED_SHARE = {"city": (0.25, 0.85), "suburb": (0.1, 0.65), "country": (0.0, 0.1)}
 _TRAFFIC = {"city": 3.0, "suburb": 1.2, "country": 1.5}
 _WALKERS = {"city": 5.0, "suburb": 1.0, "country": 0.15}
 _CYCLISTS = {"city": 0.8, "suburb": 0.35, "country": 0.15}
+_ABOUT = {"city": 12.0, "suburb": 5.0, "country": 0.0}  # things that stand about on each pavement
+_ABOUT_SHARES = {
+    furniture.BIN: 0.3, furniture.CABINET: 0.16, furniture.BENCH: 0.08, furniture.PLANTER: 0.16,
+    furniture.COLUMN: 0.03, furniture.SHELTER: 0.05, furniture.METER: 0.1, furniture.SIGNAL: 0.06,
+    furniture.GUIDE: 0.06,
+}  # fmt: skip
 _BOUNDARY_TO_M = 75.0  # hedges and fences farther away hide behind nearer ones
 
 
-def add_gardens(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> None:
-    """Line front gardens with hedges, walls and fences, close some gaps, and plant bushes."""
+def add_gardens(
+    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, town: Settlement
+) -> list[ObjectBatch]:
+    """Line front gardens with walls and fences, and close some gaps; return the hedges."""
     lines: dict[str, list[tuple[float, float, float, float]]] = {"hedge": [], "wall": [], "fence": []}
-    taste = rng.dirichlet([3.0, 1.3, 0.9])  # each street has its own
+    taste = rng.dirichlet([3.0, 1.3, 0.5])  # each street has its own
+    lined = rng.uniform(0.25, 0.85)  # and its own share of front gardens without a boundary
     for which, side in enumerate((-1, 1)):
         edge = plan.edge_m[which] + plan.pavement_m[which] + 0.15
         for low, high in free_spans(plan, side) if plan.setback_m[which] > 1.3 and plan.theme != "country" else []:
             along = max(low, -_BOUNDARY_TO_M)
             while along < min(high, _BOUNDARY_TO_M):
                 length = min(rng.uniform(4, 15), high - along)
-                if rng.random() < 0.8 and length > 1:
+                if rng.random() < lined and length > 1:
                     lines[str(rng.choice(list(lines), p=taste))].append((along, along + length, side * edge, side))
                 along += length + rng.uniform(0.8, 3.6)
     for u_from, u_to, side in town.gaps_m[np.abs(town.gaps_m[:, :2]).min(axis=1) < _BOUNDARY_TO_M]:
@@ -36,17 +47,19 @@ def add_gardens(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan
             shut = rng.uniform(0.4, 1.0) * (u_to - u_from)
             kind = str(rng.choice(list(lines), p=taste))
             lines[kind].append((u_from, u_from + min(shut, 18.0), plan.front(int(side)) + side * 0.4, side))
-    _add_lines(builder, rng, plan, lines)
     if plan.theme == "country" and rng.random() < 0.4:
-        street_furniture.add_guard_rails(builder, rng, plan, int(rng.choice([-1, 1])))
+        barriers.add_guard_rails(builder, rng, plan, int(rng.choice([-1, 1])))
+    return _add_lines(builder, rng, plan, lines)
 
 
-def _add_lines(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, lines: dict[str, list]) -> None:
-    rise = plan.level_m[1]
+def _add_lines(
+    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, lines: dict[str, list]
+) -> list[ObjectBatch]:
+    rise, hedges = plan.level_m[1], []
     for kind, add, heights, thick in (
-        ("hedge", plants.add_hedges, (0.8, 2.1), 0.9),
-        ("wall", street_furniture.add_walls, (0.4, 1.9), 0.25),
-        ("fence", street_furniture.add_fences, (0.8, 1.6), 0.0),
+        ("hedge", None, (0.8, 2.1), 0.9),
+        ("wall", barriers.add_walls, (0.4, 1.9), 0.25),
+        ("fence", barriers.add_fences, (0.8, 1.6), 0.0),
     ):
         if not lines[kind]:
             continue
@@ -57,24 +70,29 @@ def _add_lines(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan,
         step = ((line[:, 1] - line[:, 0]) / pieces)[home]
         start = line[home, 0] + order * step
         v = line[home, 2]
-        u = np.column_stack((start, start + step + (0.2 if kind == "hedge" else 0.0)))
+        u = np.column_stack((start, start + step))
         height = np.where(rng.random(len(line)) < 0.5, rng.uniform(*heights), rng.uniform(*heights, len(line)))
-        add(builder, rng, plan, u, np.column_stack((v, v + line[home, 3] * thick)), height[home], rise)
+        across = np.column_stack((v, v + line[home, 3] * thick))
+        if add is None:
+            hedges.append(make_hedges(rng, u, across, height[home], rise))
+        else:
+            add(builder, rng, plan, u, across, height[home], rise)
+    return hedges
 
 
-def add_greenery(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> None:
+def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> list[ObjectBatch]:
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
     lots = [*_parks(rng, town), *(_woods(rng) if plan.theme == "country" else [])]
-    count = rng.poisson({"city": 45, "suburb": 75, "country": 40}[plan.theme] * green)
-    lots.append(np.column_stack((rng.normal(0, 50, count), rng.normal(0, 34, count))))
+    count = rng.poisson({"city": 90, "suburb": 160, "country": 60}[plan.theme] * green)
+    lots.append(np.column_stack((rng.normal(0, 55, count), rng.normal(0, 45, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
-    plants.add_trees(builder, rng, plan, town.houses, u, v, size=rng.uniform(0.7, 1.15), rise_m=plan.level_m[1])
-    count = rng.poisson({"city": 60, "suburb": 230, "country": 50}[plan.theme] * green)
-    points = [np.column_stack((rng.normal(0, 30, count), rng.normal(0, 13, count))), *_parks(rng, town)]
+    wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
+    count = rng.poisson({"city": 45, "suburb": 170, "country": 60}[plan.theme] * green)
+    points = [np.column_stack((rng.normal(0, 35, count), rng.normal(0, 18, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
-    plants.add_bushes(builder, rng, plan, town.houses, u, v, plan.level_m[1])
+    return [*wood, make_bushes(rng, u, v, plan.level_m[1])]
 
 
 def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:
@@ -115,7 +133,7 @@ def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
     rows = []
     for which, side in enumerate((-1, 1)):
         wide = plan.theme == "country" or plan.pavement_m[which] > 1.8
-        if not wide or rng.random() > {"city": 0.35, "suburb": 0.25, "country": 0.4}[plan.theme]:
+        if not wide or rng.random() > {"city": 0.45, "suburb": 0.35, "country": 0.4}[plan.theme]:
             continue
         row = np.arange(-90.0, 90.0, rng.uniform(7, 16)) + rng.uniform(-3, 3)
         away = plan.edge_m[which] + (0.9 if plan.theme != "country" else rng.uniform(2.0, 5.0))
@@ -136,39 +154,53 @@ def _clear_of_bridge(plan: StreetPlan, u: np.ndarray, v: np.ndarray) -> tuple[np
     return u[keep], v[keep]
 
 
-def add_furniture(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
-    """Set lamps, signs, bins and bollards on the pavements."""
+def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
+    """Set lamps, signs, and all that stands about on pavements."""
     wild = plan.theme == "country"
-    lamps, signs, bins = [], [_corner_signs(rng, plan)], []  # columns: u, v, turn
+    rows = [_corner_signs(rng, plan)]  # columns: u, v, turn, kind, variant
     for which, side in enumerate((-1, 1)):
         edge, pavement = plan.edge_m[which], plan.pavement_m[which]
         if rng.random() < (0.15 if wild else 0.75):
             along = np.arange(-95.0, 95.0, rng.uniform(18, 34)) + rng.uniform(0, 15)
-            lamps.append(_beside(plan, along, side * (edge + _pole_offset(rng, pavement)), -side * np.pi / 2))
+            v = side * (edge + _pole_offset(rng, pavement))
+            rows.append(
+                _beside(plan, along, v, -side * np.pi / 2, furniture.LAMP, int(rng.integers(furniture.VARIANTS)))
+            )
         along = rng.uniform(-70, 70, rng.poisson(1.5 if wild else 3.0))
-        facing = 0.0 if side < 0 else np.pi
-        signs.append(_beside(plan, along, side * (edge + _pole_offset(rng, pavement)), facing))
+        facing, v = 0.0 if side < 0 else np.pi, side * (edge + _pole_offset(rng, pavement))
+        rows.append(_beside(plan, along, v, facing, furniture.SIGN, rng.integers(furniture.VARIANTS, size=len(along))))
         if wild or pavement < 1.2:
             continue
-        along = rng.uniform(-50, 50, rng.poisson(1.5))
-        bins.append(_beside(plan, along, side * (edge + pavement - 0.35), 0.0))
+        rows.append(_standing_about(rng, plan, which, side))
         if rng.random() < 0.25:
             first = rng.uniform(-40, 30)
-            posts = _beside(plan, np.arange(first, first + rng.uniform(6, 25), 2.0), side * (edge + 0.35), 0.0)
-            street_furniture.add_bollards(builder, rng, plan, posts[:, 0], posts[:, 1])
-    adding = (street_furniture.add_lamps, street_furniture.add_signs, street_furniture.add_bins)
-    for add, poses in zip(adding, (lamps, signs, bins), strict=True):
-        if poses:
-            u, v, turn = np.concatenate(poses).T
-            add(builder, rng, plan.poses(u, v, turn, rise_m=plan.level_m[0]))
+            along = np.arange(first, first + rng.uniform(6, 25), 2.0)
+            variant = int(rng.integers(furniture.VARIANTS))
+            rows.append(_beside(plan, along, side * (edge + 0.35), 0.0, furniture.BOLLARD, variant))
+    u, v, turn, kind, variant = np.concatenate(rows).T
+    placements = Placements.of(u, v, turn, rise_m=plan.level_m[0])
+    return furniture.make_furniture(rng, kind.astype(int), variant.astype(int), placements)
+
+
+def _standing_about(rng: np.random.Generator, plan: StreetPlan, which: int, side: int) -> np.ndarray:
+    """Sample bins, cabinets, benches, tubs and the like: the low ones by the houses, few by the kerb."""
+    count = rng.poisson(_ABOUT[plan.theme])
+    kind = rng.choice(list(_ABOUT_SHARES), count, p=list(_ABOUT_SHARES.values()))
+    at_kerb = np.isin(kind, (furniture.METER, furniture.SIGNAL, furniture.GUIDE)) | (rng.random(count) < 0.2)
+    wide = np.where(kind == furniture.SHELTER, 1.0, 0.45)
+    v = plan.edge_m[which] + np.where(at_kerb, 0.5, np.maximum(plan.pavement_m[which] - wide, 0.6))
+    u, turn = rng.uniform(-60, 60, count), np.where(side < 0, -np.pi / 2, np.pi / 2) + 0 * v
+    turn = np.where(np.isin(kind, (furniture.SIGNAL, furniture.GUIDE)), 0.0 if side < 0 else np.pi, turn)
+    return _beside(plan, u, side * v, turn, kind, rng.integers(furniture.VARIANTS, size=count))
 
 
 def _corner_signs(rng: np.random.Generator, plan: StreetPlan) -> np.ndarray:
-    rows = [(s.u_m + way * (s.half_m + s.pavement_m * 0.6), plan.edge(side) + side * 0.7, 0.0)
+    rows = [(s.u_m + way * (s.half_m + s.pavement_m * 0.6), plan.edge(side) + side * 0.7, 0.0, furniture.SIGN, 0)
             for s in plan.side_streets for side in s.sides for way in (-1, 1)]  # fmt: skip
-    signs = np.array(rows).reshape(-1, 3)
+    signs = np.array(rows, float).reshape(-1, 5)
     signs = signs[rng.random(len(signs)) < 0.6]
     signs[:, 2] = rng.integers(0, 4, len(signs)) * np.pi / 2
+    signs[:, 4] = rng.integers(furniture.VARIANTS, size=len(signs))
     return signs
 
 
@@ -177,11 +209,11 @@ def _pole_offset(rng: np.random.Generator, pavement_m: float) -> float:
     return float(rng.choice([0.5, max(pavement_m - 0.25, 0.6)]) + rng.uniform(-0.1, 0.15))
 
 
-def _beside(plan: StreetPlan, u: np.ndarray, v_m: float, turn_rad: float) -> np.ndarray:
-    """Return rows of u, v, turn without those in the mouths of side streets and below the bridge."""
-    u, v = _clear_of_bridge(plan, u, np.full(len(u), v_m))
-    clear = plan.in_side_street(u, v, 1.0) < 0
-    return rows_of(u, v, turn_rad)[clear]
+def _beside(plan: StreetPlan, *columns: float | np.ndarray) -> np.ndarray:
+    """Return rows of u, v and more without those in the mouths of side streets and below the bridge."""
+    rows = rows_of(*columns)
+    near_bridge = np.abs(rows[:, 0] - plan.bridge_u_m) < 14.0
+    return rows[~near_bridge & (plan.in_side_street(rows[:, 0], rows[:, 1], 1.0) < 0)]
 
 
 def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Placements:
@@ -243,13 +275,10 @@ def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> lis
     resting, going = parked(rng, plan, town), driving(rng, plan, plan.speed_m_s)
     placements = Placements.join([resting, going])
     kinds = np.concatenate(
-        (sample_vehicle_kinds(rng, len(resting), trucks=0.0), sample_vehicle_kinds(rng, len(going), trucks=0.06))
+        (sample_vehicle_kinds(rng, len(resting), large=0.0), sample_vehicle_kinds(rng, len(going), large=0.06))
     )
     kinds[placements.across] = HATCHBACK  # short drives and narrow streets
-    away = np.append(
-        town.houses.nearest_approach_m(plan, plan.ground_points(resting.u_m, resting.v_m)), _nearest_m(plan, going)
-    )
-    groups = make_vehicles(rng, kinds, placements, 1, away)
+    groups = [make_vehicles(rng, kinds, placements, 1)]
     following = len(placements) + 1
     walkers = _walkers(rng, plan)
     if len(walkers):
@@ -275,15 +304,6 @@ def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> lis
     if clear.any():
         groups.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
     return groups
-
-
-def _nearest_m(plan: StreetPlan, going: Placements) -> np.ndarray:
-    """Return the smallest distance of driving vehicles from our car, which drives too, in the first seconds."""
-    apart = []
-    for time_s in (0.0, 1.0, 2.0):
-        u, v = going.positions_at(time_s)
-        apart.append(np.hypot(u - plan.speed_m_s * time_s, v - plan.our_v_m))
-    return np.min(apart, axis=0)
 
 
 def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:

@@ -1,11 +1,11 @@
-"""Objects that stand or move: shapes in their own frames, and poses → triangles at a time."""
+"""Objects that stand or move: kept shapes and places in the street → objects of the scene at a time."""
 
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Num, Shaped, UInt8, UInt16
+from jaxtyping import Float32, Float64, Int32, Num, Shaped, UInt16
 
-from lidargrit.simulator.scene.shapes import MeshBuilder
+from lidargrit.simulator.mesh import Objects, Shape
 from lidargrit.simulator.scene.street_plan import StreetPlan
 
 
@@ -64,32 +64,53 @@ class Placements:
 
 @dataclass(frozen=True, eq=False)
 class ObjectBatch:
-    """Objects of one topology, each with x ahead and its foot at the origin.
+    """Objects of kept shapes that stand or move.
 
     Args:
-        local_m: triangles of each object in its own frame.
-        material: material index of each triangle.
-        albedo: albedo of each triangle.
-        label: class of each triangle.
-        instance: instance number of each object.
+        shapes: shape of each object.
+        size: factors by which each is stretched along, across and upwards.
+        albedo: brightness of the parts of each object.
+        label: classes of the parts of each object.
+        instance: number of each object; 0 for what is no single object.
         placements: positions and motion of the objects.
+        leans: whether they stand square to the ground, as vehicles do, and not upright, as trees do.
     """
 
-    local_m: Float32[np.ndarray, "n t 3 3"]
-    material: UInt8[np.ndarray, "n t"]
-    albedo: Float32[np.ndarray, "n t"]
-    label: UInt16[np.ndarray, "n t"]
+    shapes: tuple[Shape, ...]
+    size: Float64[np.ndarray, "n 3"]
+    albedo: tuple[Float32[np.ndarray, " _"], ...]
+    label: tuple[UInt16[np.ndarray, " _"], ...]
     instance: Int32[np.ndarray, " n"]
     placements: Placements
+    leans: bool = False
 
-    def add_to(self, builder: MeshBuilder, plan: StreetPlan, time_s: float = 0.0) -> None:
-        """Add the objects to a mesh at their positions at a time."""
-        if not len(self.placements):
-            return
+    @classmethod
+    def standing(
+        cls,
+        shapes: list[Shape],
+        size: Float64[np.ndarray, "n 3"],
+        albedo: Num[np.ndarray, "n p"],
+        label: tuple[int, ...],
+        placements: Placements,
+    ) -> "ObjectBatch":
+        """Make things that are no single objects to a labeller: all upright, with parts of the same classes."""
+        bright, classes = np.asarray(albedo, np.float32), np.array(label, np.uint16)
+        nobody = np.zeros(len(shapes), np.int32)
+        return cls(tuple(shapes), size, tuple(bright), (classes,) * len(shapes), nobody, placements)
+
+    def at(self, plan: StreetPlan, time_s: float = 0.0) -> Objects:
+        """Return the objects in the world at a time."""
         s = self.placements
         poses = plan.poses(*s.positions_at(time_s), s.turn_rad, s.across, s.rise_m)
-        local = poses.to_world(self.local_m, lean=True)
-        builder.add(local, self.material, self.albedo, self.label, self.instance[:, None])
+        frame = np.zeros((len(s), 4, 4))
+        cos, sin = np.cos(poses.yaw_rad), np.sin(poses.yaw_rad)
+        frame[:, 0, 0], frame[:, 0, 1], frame[:, 1, 0], frame[:, 1, 1] = cos, -sin, sin, cos
+        frame[:, 2, 2], frame[:, 3, 3] = 1, 1
+        if self.leans:
+            frame[:, 2, :2] = np.einsum("nk,nkj->nj", poses.slope, frame[:, :2, :2])
+        frame[:, :3, :3] *= self.size[:, None]
+        frame[:, :3, 3] = poses.xyz_m
+        return Objects(self.shapes, frame, self.albedo, self.label, self.instance)
 
     def split(self) -> "tuple[ObjectBatch, ObjectBatch]":
         """Return those that stand and those that move."""
@@ -97,6 +118,6 @@ class ObjectBatch:
         return self._select(np.flatnonzero(~moves)), self._select(np.flatnonzero(moves))
 
     def _select(self, which: np.ndarray) -> "ObjectBatch":
-        arrays = (self.local_m, self.material, self.albedo, self.label, self.instance)
-        local, material, albedo, label, instance = (a[which] for a in arrays)
-        return ObjectBatch(local, material, albedo, label, instance, self.placements.select(which))
+        albedo, label = (tuple(row[at] for at in which) for row in (self.albedo, self.label))
+        shapes, placements = tuple(self.shapes[at] for at in which), self.placements.select(which)
+        return ObjectBatch(shapes, self.size[which], albedo, label, self.instance[which], placements, self.leans)

@@ -1,163 +1,179 @@
-"""Trees, bushes and hedges: positions and sizes → trunks and crowns of many small leaves that let beams through."""
+"""Trees, bushes and hedges: kept shapes of trunks, limbs and small leaves that let beams through; places → objects."""
+
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Num
 
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
-from lidargrit.simulator.scene.buildings import Houses
-from lidargrit.simulator.scene.shapes import MeshBuilder, leaves, owners, rows_of, tubes
+from lidargrit.simulator.mesh import Shape
+from lidargrit.simulator.scene.objects import ObjectBatch, Placements
+from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, leaves, sweep
 from lidargrit.simulator.scene.street_plan import StreetPlan
 
-_LEAVES = 30_000  # in one go at most: denser woods have fewer and larger leaves
-_LIMBS_TO_M = 30.0  # limbs farther away are thinner than a beam, and lost in leaves
-_BLOBS = 7  # round tufts that make up a crown
+TREES, BUSHES, HEDGES = 30, 20, 6  # shapes of each
+_TRUNK, _LIMBS, _LEAVES = range(3)
+_MATERIALS = (materials.BARK, materials.BARK, materials.LEAVES)
+_LABELS = (classes.TRUNK, classes.VEGETATION, classes.VEGETATION)
+_HEDGE_M = np.array([5.0, 0.9, 1.4])  # of the shapes: pieces that overlap a little
+# Height, its part below the crown, half the width of the crown, leaves; a round, a high, a slim, a small one, a fir.
+_HABITS = ((9.5, 0.30, 3.2, 3400), (12.0, 0.28, 3.0, 3800), (13.0, 0.10, 1.4, 3000), (5.5, 0.36, 1.7, 2200),
+           (11.0, 0.06, 2.3, 3600))  # fmt: skip
+_FIR = 4
 
 
-def _points_in_tuft(count: int = 4096) -> np.ndarray:
-    """Return positions in a ball, denser at its surface, from which those of all leaves are sampled."""
-    rng = np.random.default_rng(0)
+def _ball(rng: np.random.Generator, count: int) -> Float[np.ndarray, "n 3"]:
+    """Return positions in a unit ball, denser at its surface."""
     way = rng.normal(size=(count, 3))
     way /= np.linalg.norm(way, axis=1, keepdims=True)
-    return (way * 0.42 * rng.random((count, 1)) ** 0.45).astype(np.float32)
+    return way * rng.random((count, 1)) ** 0.45
 
 
-_TUFT = _points_in_tuft()
+@cache
+def tree_shapes(variant: int) -> tuple[Shape, Shape]:
+    """Return one tree, made once, from its own seed: its trunk, and limbs with a tuft of leaves around each end.
+
+    Many rays pass below a crown; in two shapes they are cast at the trunk alone.
+    """
+    rng, builder = np.random.default_rng((74, variant)), ShapeBuilder(*_MATERIALS)
+    stem = ShapeBuilder(*_MATERIALS)
+    habit = variant % len(_HABITS)
+    tall, bare, wide, number = np.array(_HABITS[habit]) * rng.uniform(0.85, 1.15, 4)
+    foot = bare * tall
+    thick = tall * rng.uniform(0.009, 0.016)
+    share = np.linspace(0, 1, 7)
+    bend = np.cumsum(rng.normal(0, 0.03, (7, 2)), axis=0) * share[:, None]
+    high = 0.95 if habit in (2, _FIR) else 0.62
+    spine = np.column_stack((bend * tall * 0.12, -0.3 + (high * tall + 0.3) * share))
+    radius = thick * (1.25 - 0.9 * share)
+    radius[0] *= 1.3
+    stem.add(_TRUNK, sweep(spine, radius, 10))
+    count = 36 if habit == _FIR else 22
+    level = np.sort(rng.uniform(0.0, 1.0, count))
+    way = np.arange(count) * 2.399963 + rng.normal(0, 0.3, count)
+    if habit == _FIR:
+        reach, rise = wide * (1.05 - level) * rng.uniform(0.6, 0.95, count), rng.uniform(-0.6, -0.1, count)
+        start_m = foot + (tall * 0.97 - foot) * level
+        size = np.column_stack((np.maximum(0.5 * reach, 0.25),) * 2 + (np.full(count, 0.35),))
+    else:
+        outline = np.sqrt(np.maximum(1 - (2 * level - 0.9) ** 2 / 1.25, 0.1))
+        reach, rise = wide * outline * rng.uniform(0.35, 0.75, count), (0.1 + 0.25 * level) * wide
+        start_m = foot * 0.95 + (high * tall - foot) * level * 0.95
+        tuft = (0.3, 0.48) if habit in (0, 3) else (0.42, 0.62)
+        size = wide * rng.uniform(*tuft, (count, 1)) * np.array([1.0, 1.0, 0.9])
+    core = np.column_stack([np.interp(start_m, spine[:, 2], spine[:, axis]) for axis in (0, 1)])
+    start = np.column_stack((core, start_m))
+    lift = np.where(np.full(count, habit == _FIR), rise, rise + (tall - high * tall) * level**1.5 * 0.9)
+    tip = start + np.column_stack((reach * np.cos(way), reach * np.sin(way), lift))
+    for a, b in zip(start, tip, strict=True):
+        elbow = a + 0.5 * (b - a) + np.array([0, 0, 0.08 * (b - a)[2]])
+        builder.add(_LIMBS, sweep(np.stack((a, elbow, b)), thick * np.array([0.42, 0.28, 0.1]), 5))
+    volume = size.prod(axis=1) ** (2 / 3)
+    home = rng.choice(count, int(number), p=volume / volume.sum())
+    centre = tip[home] + _ball(rng, len(home)) * size[home]
+    centre[:, 2] = np.maximum(centre[:, 2], foot * 0.8)
+    face = np.pi * wide * (tall - foot) / 2 * (0.55 if habit == _FIR else 1.0)
+    leaf = np.sqrt(rng.uniform(1.7, 2.8) * face / (0.65 * number))
+    builder.add(_LEAVES, leaves(centre, leaf * rng.uniform(0.75, 1.25, len(home))))
+    return stem.build(), builder.build()
 
 
-def _leaf_m(away_m: np.ndarray) -> np.ndarray:
-    """Return the radius of leaves, or tufts of them: small where beams lie close, and not smaller than beams later."""
-    return np.maximum(np.clip(0.1 + 0.0045 * away_m, 0.14, 0.5), np.minimum(0.163 + 0.01 * (away_m - 14.0), 0.75))
+@cache
+def bush_shape(variant: int) -> Shape:
+    """Return one bush about a metre high and wide, whose leaves begin at the ground; made once, from its own seed."""
+    rng, builder = np.random.default_rng((75, variant)), ShapeBuilder(*_MATERIALS)
+    count, number = int(rng.integers(5, 12)), 1100
+    middle = _ball(rng, count) * np.array([0.42, 0.42, 0.36]) + np.array([0, 0, 0.42])
+    size = rng.uniform(0.24, 0.42, (count, 1)) * np.array([1, 1, 0.9])
+    home = rng.integers(0, count, number)
+    centre = middle[home] + _ball(rng, number) * size[home]
+    centre[:, 2] = np.abs(centre[:, 2])
+    builder.add(_LEAVES, leaves(centre, rng.uniform(0.05, 0.085, number)))
+    for end in middle:
+        builder.add(_LIMBS, sweep(np.stack(([0, 0, -0.1], end * [0.4, 0.4, 0.7], end)), np.array([0.025, 0.018, 0.01]),
+                                  4))  # fmt: skip
+    return builder.build()
 
 
-def add_trees(
-    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, houses: Houses, u_m: Num[np.ndarray, " n"],
-    v_m: Num[np.ndarray, " n"], size: float = 1.0, rise_m: float = 0.0,
-) -> None:  # fmt: skip
-    """Add trees with a clear trunk, forked below the crown; ``size`` 1 is a street tree of about 8 m."""
+@cache
+def hedge_shape(variant: int) -> Shape:
+    """Return a piece of a cut hedge, dense in its heart, with leaves that stand out a hand; made once."""
+    rng, builder = np.random.default_rng((76, variant)), ShapeBuilder(*_MATERIALS)
+    half = _HEDGE_M * np.array([0.5, 0.5, 1.0])
+    builder.add(_LEAVES, boxes(np.array([-half[0], -half[1] + 0.13, -0.3]), half - np.array([0.0, 0.13, 0.13])))
+    number = 2600
+    point = rng.uniform(-1, 1, (number, 3))
+    face = rng.choice(3, number, p=[0.32, 0.32, 0.36])
+    point[face == 0, 1], point[face == 1, 1], point[face == 2, 2] = -1, 1, 1
+    point *= half * np.array([1, 1, 0.5])
+    point[:, 2] += half[2] / 2
+    wave = sum(np.sin(point @ rng.normal(0, 3.0, 3) + rng.uniform(0, 6)) for _ in range(4)) / 4
+    inward = np.abs(rng.normal(0, 0.03, number)) + 0.05 - 0.05 * wave
+    side = face < 2
+    point[side, 1] -= np.sign(point[side, 1]) * inward[side]
+    point[~side, 2] -= inward[~side]
+    builder.add(_LEAVES, leaves(point, rng.uniform(0.05, 0.1, number)))
+    return builder.build()
+
+
+def _batch(
+    rng: np.random.Generator, shapes: list[Shape], size: np.ndarray, green: np.ndarray, placements: Placements
+) -> ObjectBatch:
+    bark = rng.uniform(0.2, 0.4, len(shapes))
+    return ObjectBatch.standing(shapes, size, np.column_stack((bark, bark, green)), _LABELS, placements)
+
+
+def make_trees(
+    rng: np.random.Generator, plan: StreetPlan, u_m: Num[np.ndarray, " n"], v_m: Num[np.ndarray, " n"],
+    size: float = 1.0, rise_m: float = 0.0,
+) -> list[ObjectBatch]:  # fmt: skip
+    """Sample trees, trunks and crowns apart; ``size`` 1 is a street of trees of about 10 m.
+
+    Near the road none has low branches.
+    """
     count = len(u_m)
-    if not count:
-        return
-    foot = plan.ground_points(u_m, v_m) + np.array([0, 0, rise_m])
-    tall = size * rng.uniform(5.0, 11.0, count)
-    over_road = np.abs(v_m) < max(plan.edge_m) + 4.5  # no branches as low as our own car
-    clear = np.clip(tall * rng.uniform(0.1, 0.36, count), np.where(over_road, 2.5, 0.5), 4.0)
-    wide = np.minimum(size * rng.uniform(1.2, 3.2, count), (tall - clear) * 0.75)
-    trunk = np.clip(tall * rng.uniform(0.009, 0.022, count), 0.05, 0.3)
-    fork = clear + 0.25 * (tall - clear)
-    lean = rng.normal(0, 0.02, (count, 2)) * fork[:, None]
-    top = foot + np.column_stack((lean, fork))
-    bark = rng.uniform(0.2, 0.4, (count, 1))
-    away = houses.nearest_approach_m(plan, foot)
-    near = away < _LIMBS_TO_M
-    for some, sides in ((near, 7), (~near, 4)):
-        stems = tubes((foot - np.array([0, 0, 0.3]))[some], top[some], trunk[some] * 1.15, trunk[some] * 0.75, sides)
-        builder.add(
-            stems[:, : 2 * sides], materials.BARK, bark[some], classes.TRUNK
-        )  # nobody sees the cap in the crown
-    limb = np.repeat(np.flatnonzero(near), 4)
-    way = rng.uniform(0, 2 * np.pi, len(limb))
-    reach = wide[limb] * rng.uniform(0.4, 0.8, len(limb))
-    rise = (tall - fork)[limb] * rng.uniform(0.3, 0.7, len(limb))
-    tip = top[limb] + rows_of(reach * np.cos(way), reach * np.sin(way), rise)
-    start = foot[limb] + (top - foot)[limb] * rng.uniform(0.75, 1.0, (len(limb), 1))
-    builder.add(tubes(start, tip, trunk[limb] * 0.5, 0.02, sides=4), materials.BARK, bark[limb], classes.VEGETATION)
-    middle = foot + np.column_stack((lean, (clear + tall) / 2))
-    _add_crowns(builder, rng, middle, wide, (tall - clear) / 2, away, density=1.0)
+    over_road = np.abs(v_m) < max(plan.edge_m) + 4.5
+    variant = rng.integers(0, TREES, count)
+    spread = variant % len(_HABITS)
+    variant = np.where(over_road & ((spread == 2) | (spread == _FIR)), variant - spread + rng.integers(0, 2), variant)
+    grown = size * rng.uniform(0.7, 1.35, count)
+    # The lowest leaves of a tree beside the road hang higher than a car, at a quarter of its height or more.
+    upwards = grown * np.where(over_road, np.maximum(1.0, 3.2 / np.maximum(2.4 * grown, 1.0)), 1.0)
+    stretch = np.column_stack((grown, grown * rng.uniform(0.9, 1.1, count), upwards))
+    placements = Placements.of(u_m, v_m, rng.uniform(0, 2 * np.pi, count), rise_m=rise_m)
+    shapes, green = [tree_shapes(int(v)) for v in variant], rng.uniform(0.3, 0.6, count)
+    return [_batch(rng, [pair[part] for pair in shapes], stretch, green, placements) for part in (0, 1)]
 
 
-def add_bushes(
-    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, houses: Houses, u_m: Num[np.ndarray, " n"],
-    v_m: Num[np.ndarray, " n"], rise_m: float = 0.0,
-) -> None:  # fmt: skip
-    """Add bushes and conifers whose leaves begin at the ground."""
+def make_bushes(
+    rng: np.random.Generator, u_m: Num[np.ndarray, " n"], v_m: Num[np.ndarray, " n"], rise_m: float = 0.0
+) -> ObjectBatch:
+    """Sample bushes, most of them lower than a metre and a half."""
     count = len(u_m)
-    if not count:
-        return
-    foot = plan.ground_points(u_m, v_m) + np.array([0, 0, rise_m])
-    wide = rng.uniform(0.4, 1.8, count)
-    half = np.where(rng.random(count) < 0.25, rng.uniform(1.2, 2.6, count), wide * rng.uniform(0.6, 1.1, count))
-    _add_crowns(
-        builder,
-        rng,
-        foot + rows_of(0.0, 0.0, half * 0.9),
-        wide,
-        half,
-        houses.nearest_approach_m(plan, foot),
-        density=1.6,
-    )
+    wide = rng.uniform(0.6, 2.4, count)
+    high = np.where(rng.random(count) < 0.2, rng.uniform(1.5, 3.0, count), wide * rng.uniform(0.5, 0.9, count))
+    stretch = np.column_stack((wide, wide * rng.uniform(0.8, 1.2, count), high))
+    placements = Placements.of(u_m, v_m, rng.uniform(0, 2 * np.pi, count), rise_m=rise_m)
+    shapes = [bush_shape(int(v)) for v in rng.integers(0, BUSHES, count)]
+    return _batch(rng, shapes, stretch, rng.uniform(0.3, 0.6, count), placements)
 
 
-def _add_crowns(
-    builder: MeshBuilder,
+def make_hedges(
     rng: np.random.Generator,
-    middle: np.ndarray,
-    wide: np.ndarray,
-    half: np.ndarray,
-    away: np.ndarray,
-    density: float,
-) -> None:
-    """Fill round tufts within ellipsoids with leaves; far crowns have fewer and larger ones."""
-    count = len(middle)
-    leaf = np.minimum(_leaf_m(away), 0.5 * np.minimum(wide, half)) * rng.uniform(0.85, 1.25, count)
-    face = np.pi * wide * half  # of the crown from the side
-    thick = density * rng.uniform(0.8, 2.2, count)  # leaves one behind another
-    number = np.clip(thick * face / (0.65 * leaf**2), 12, 1100)
-    spared = np.minimum(1.0, _LEAVES / max(number.sum(), 1.0))
-    number, leaf = (number * spared).astype(int), leaf / np.sqrt(spared)
-    out = rng.normal(size=(count, _BLOBS, 3))
-    out /= np.linalg.norm(out, axis=2, keepdims=True) + 1e-9
-    scale = rows_of(wide, wide, half)
-    tuft = middle[:, None] + out * rng.uniform(0.3, 0.68, (count, _BLOBS, 1)) * scale[:, None]
-    home = owners(number)
-    pick = home * _BLOBS + rng.integers(0, _BLOBS, len(home))
-    within = _TUFT[rng.integers(0, len(_TUFT), len(home))]
-    centre = tuft.reshape(-1, 3).astype(np.float32)[pick] + within * scale.astype(np.float32)[home]
-    green = rng.uniform(0.3, 0.6, count)
-    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], classes.VEGETATION)
-
-
-def add_hedges(
-    builder: MeshBuilder,
-    rng: np.random.Generator,
-    plan: StreetPlan,
     u_m: Float[np.ndarray, "n 2"],
     v_m: Float[np.ndarray, "n 2"],
     height_m: Float[np.ndarray, " n"],
     rise_m: float = 0.0,
-) -> None:
-    """Add cut hedges in boxes of the street: a dense heart a hand below the surface, and leaves all over."""
-    if not len(u_m):
-        return
-    low_u, low_v = u_m.min(axis=1) + 0.12, v_m.min(axis=1) + 0.12
-    high_u, high_v = u_m.max(axis=1) - 0.12, v_m.max(axis=1) - 0.12
-    heart = plan.blocks(low_u, high_u, low_v, high_v, -0.3, rise_m + height_m - 0.12)
-    green = rng.uniform(0.3, 0.6, len(u_m))
-    builder.add(heart, materials.LEAVES, green[:, None] * 0.8, classes.VEGETATION)
-    size = rows_of(high_u - low_u, high_v - low_v, height_m) + np.array([0.24, 0.24, 0])
-    middle = rows_of((low_u + high_u) / 2, (low_v + high_v) / 2, height_m / 2)
-    leaf = np.minimum(0.9 * _leaf_m(plan.nearest_approach_m(plan.ground_points(middle[:, 0], middle[:, 1]))), 0.35)
-    skin = size[:, 2] * (size[:, 0] + size[:, 1]) * 2 + size[:, 0] * size[:, 1]
-    number = np.clip(0.45 * skin / leaf**2, 20, 900).astype(int)
-    home = owners(number)
-    inside = rng.random((len(home), 3)) - 0.5
-    # Leaves move to a face: to the long sides and the top more often than to the ends, by their areas.
-    area = np.column_stack((size[:, 1] * size[:, 2] * 2, size[:, 0] * size[:, 2] * 2, size[:, 0] * size[:, 1]))
-    share = np.cumsum(area / area.sum(axis=1, keepdims=True), axis=1)[home]
-    chance = rng.random(len(home))
-    axis = (chance[:, None] > share[:, :2]).sum(axis=1)
-    side = np.where(axis == 2, 0.5, np.where(inside[np.arange(len(home)), axis] > 0, 0.5, -0.5))
-    deep = 0.12 * rng.random(len(home)) / size[home, axis]
-    inside[np.arange(len(home)), axis] = side - np.sign(side) * deep
-    at_m = middle[home] + inside * size[home]
-    corners = plan.ground_points(
-        np.stack((low_u, high_u, low_u, high_u), axis=1), np.stack((low_v, low_v, high_v, high_v), axis=1)
-    )
-    du, dv = (
-        (at_m[:, 0] - low_u[home]) / (high_u - low_u)[home],
-        (at_m[:, 1] - low_v[home]) / (high_v - low_v)[home],
-    )
-    shares = np.stack(((1 - du) * (1 - dv), du * (1 - dv), (1 - du) * dv, du * dv), axis=1)
-    centre = np.einsum("nk,nkc->nc", shares, corners[home])  # hedges are straight: no need to bend every leaf
-    centre[:, 2] += at_m[:, 2] + rise_m
-    builder.add(leaves(centre, leaf[home]), materials.LEAVES, green[home], classes.VEGETATION)
+) -> ObjectBatch:
+    """Make cut hedges that fill boxes of the street, each as several pieces along it."""
+    length = u_m[:, 1] - u_m[:, 0]
+    pieces = np.maximum(np.ceil(length / 5.5), 1).astype(int)
+    home = np.repeat(np.arange(len(length)), pieces)
+    order = np.arange(len(home)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    step = (length / pieces)[home]
+    green = rng.uniform(0.3, 0.6, len(length))
+    size = np.column_stack((step + 0.1, np.abs(v_m[home, 1] - v_m[home, 0]), height_m[home])) / _HEDGE_M
+    turn = rng.integers(0, 2, len(home)) * np.pi
+    placements = Placements.of(u_m[home, 0] + (order + 0.5) * step, v_m[home].mean(axis=1), turn, rise_m=rise_m)
+    return _batch(rng, [hedge_shape(int(v)) for v in rng.integers(0, HEDGES, len(home))], size, green[home], placements)

@@ -79,7 +79,7 @@ def _v_edges(plan: StreetPlan) -> np.ndarray:
 def _kinds(plan: StreetPlan, rng: np.random.Generator, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return what each cell of the grid is."""
     bays = rng.random(2) < 0.35  # some parked rows stand on a strip of their own
-    green = {"city": 0.35, "suburb": 0.8, "country": 1.0}[plan.theme]
+    green = {"city": 0.25, "suburb": 0.6, "country": 1.0}[plan.theme]
     block = (np.floor(u / 17.0) * 7 + np.floor(v / 23.0)).astype(int) % 64
     kind = np.where((rng.random(64) < green)[block], _GREEN, _YARD)
     for street in plan.side_streets:
@@ -144,7 +144,9 @@ def add_markings(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPla
     bar = np.concatenate(clear)
     corners = plan.ground_points(bar[:, [0, 1, 1, 0]], bar[:, [2, 2, 3, 3]])
     corners[..., 2] += _PAINT_M
-    bright = rng.uniform(0.5, 0.7) * rng.uniform(0.85, 1.0, (len(bar), 1))
+    bright = rng.uniform(0.2, 0.32) * rng.uniform(
+        0.85, 1.0, (len(bar), 1)
+    )  # KITTI's read .37, half as much as road again
     builder.add(quads(corners), materials.ASPHALT, bright, classes.LANE_MARKING)
 
 

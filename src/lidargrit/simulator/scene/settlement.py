@@ -13,10 +13,10 @@ from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
 _LENGTH_M = {"city": (8.0, 20.0), "suburb": (7.5, 14.0), "country": (9.0, 18.0)}
 _DEPTH_M = {"city": (9.0, 13.0), "suburb": (7.5, 11.0), "country": (8.0, 14.0)}
 _STOREYS = {"city": (2, 6), "suburb": (1, 4), "country": (1, 3)}
-_GAP_CHANCE = {"city": 0.22, "suburb": 0.72, "country": 1.0}
-_GAP_M = {"city": (2.5, 9.0), "suburb": (2.5, 11.0), "country": (10.0, 90.0)}
-_BEHIND = {"city": 0.6, "suburb": 0.45, "country": 0.06}  # share of the places behind the rows that are built on
-_PARK_CHANCE = {"city": 0.07, "suburb": 0.14, "country": 0.3}
+_GAP_CHANCE = {"city": 0.22, "suburb": 0.65, "country": 1.0}
+_GAP_M = {"city": (2.5, 9.0), "suburb": (2.5, 9.0), "country": (10.0, 90.0)}
+_BEHIND = {"city": 0.85, "suburb": 0.8, "country": 0.1}  # share of the places behind the rows that are built on
+_PARK_CHANCE = {"city": 0.07, "suburb": 0.13, "country": 0.3}
 _LATTICE_M = 24.0
 
 
@@ -197,7 +197,7 @@ def _sample_houses(
     flat = plain | (rng.random(count) < (0.25 if plan.theme == "city" else 0.12))
     slope = rng.uniform(0.5, 1.0, count)
     material = rng.choice([materials.PLASTER, materials.BRICK, materials.CONCRETE], count, p=[0.72, 0.18, 0.1])
-    bright = np.where(material == materials.PLASTER, rng.uniform(0.2, 0.7, count), rng.uniform(0.2, 0.45, count))
+    bright = np.where(material == materials.PLASTER, rng.uniform(0.35, 0.85, count), rng.uniform(0.25, 0.55, count))
     return Houses(
         poses=plan.poses(placements.u_m, placements.v_m, placements.turn_rad, placements.across, plan.level_m[1]),
         length_m=size[:, 0],

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Num
 
-from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.mesh import Mesh, Shape
 
 # Corners of a box are numbered 4 x + 2 y + z, with 1 for the high side.
 _BOX_FACES = np.array(
@@ -46,7 +46,33 @@ class MeshBuilder:
 
     def build(self) -> Mesh:
         """Return all that was added, in order."""
-        return Mesh(*(np.concatenate(column) for column in zip(*self._parts, strict=True)))
+        triangles_m, material, albedo, label, instance = (np.concatenate(c) for c in zip(*self._parts, strict=True))
+        return Mesh(material, albedo, label, instance, triangles_m)
+
+
+class ShapeBuilder:
+    """Collects the parts of one shape, each of one material.
+
+    Args:
+        materials: material of each part.
+    """
+
+    def __init__(self, *materials: int) -> None:
+        self._materials = np.array(materials, np.uint8)
+        self._triangles: list[np.ndarray] = []
+        self._parts: list[np.ndarray] = []
+
+    def add(self, part: int, triangles_m: Num[np.ndarray, "*lead 3 3"]) -> None:
+        """Add triangles to a part; what has no area is left out."""
+        flat = np.asarray(triangles_m, np.float32).reshape(-1, 3, 3)
+        normal = np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+        flat = flat[np.linalg.norm(normal, axis=1) > 1e-7]
+        self._triangles.append(flat)
+        self._parts.append(np.full(len(flat), part, np.uint8))
+
+    def build(self) -> Shape:
+        """Return the shape."""
+        return Shape(np.concatenate(self._triangles), np.concatenate(self._parts), self._materials)
 
 
 def boxes(low_m: Num[np.ndarray, "*lead 3"], high_m: Num[np.ndarray, "*lead 3"]) -> Float32[np.ndarray, "*lead 12 3 3"]:
@@ -90,6 +116,33 @@ def tubes(
     tip = np.broadcast_to(end[:, None], low.shape)
     faces = [(low, low_next, high_next), (low, high_next, high), (high, high_next, tip)]
     return np.concatenate([np.stack(face, axis=2) for face in faces], axis=1)
+
+
+def sweep(
+    path_m: Num[np.ndarray, "k 3"], radius_m: Num[np.ndarray, " k"], sides: int = 8
+) -> Float32[np.ndarray, "t 3 3"]:
+    """Return a round body along a path of points, of a radius at each, closed by its first and last ring."""
+    path, radius = np.asarray(path_m, np.float64), np.asarray(radius_m, np.float64)
+    way = np.gradient(path, axis=0)
+    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    helper = np.array([0.0, 0.0, 1.0]) if abs(way[:, 2]).mean() < 0.8 else np.array([1.0, 0.0, 0.0])
+    across = np.cross(way, helper)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    up = np.cross(way, across)
+    turn = 2 * np.pi / sides * np.arange(sides)
+    ring = np.cos(turn)[:, None] * across[:, None] + np.sin(turn)[:, None] * up[:, None]
+    rings = path[:, None] + ring * radius[:, None, None]
+    return np.concatenate((loft(rings[None]).reshape(-1, 3, 3), fans(rings[[0, -1]]).reshape(-1, 3, 3)))
+
+
+def lathe(
+    radius_m: Num[np.ndarray, " k"], height_m: Num[np.ndarray, " k"], sides: int = 16
+) -> Float32[np.ndarray, "t 3 3"]:
+    """Return a body turned about the z axis: a radius at each height, in the order of the outline."""
+    turn = 2 * np.pi / sides * np.arange(sides)
+    radius, height = (np.asarray(a, np.float64)[:, None] for a in (radius_m, height_m))
+    rings = np.stack((radius * np.cos(turn), radius * np.sin(turn), height + 0 * turn), axis=-1)
+    return loft(rings[None]).reshape(-1, 3, 3)
 
 
 def loft(rings_m: Num[np.ndarray, "n s r 3"]) -> Float32[np.ndarray, "n s-1 r 2 3 3"]:

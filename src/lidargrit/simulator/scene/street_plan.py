@@ -15,11 +15,15 @@ from lidargrit.simulator.scene.shapes import blocks
 Theme = Literal["city", "suburb", "country", "mixed"]
 EXTENT_M = 125.0  # a little more than the 120 m that the sensor sees
 _PARKING_M = 2.1  # width of a parked row
-_PARK_CHANCE = {"city": (0.7, 0.65), "suburb": (0.5, 0.45), "country": (0.0, 0.0)}  # right, left
-_LANE_M = {"city": (2.9, 3.5), "suburb": (2.6, 3.1), "country": (2.8, 3.4)}
+_PARK_CHANCE = {"city": (0.65, 0.65), "suburb": (0.5, 0.5), "country": (0.0, 0.0)}  # right, left
+_LANE_M = {"city": (2.9, 3.7), "suburb": (2.7, 3.4), "country": (2.8, 3.4)}
 _PAVEMENT_M = {"city": (2.0, 4.5), "suburb": (1.2, 2.8), "country": (0.0, 0.01)}
-_SETBACK_M = {"city": (0.0, 2.5), "suburb": (2.0, 8.5), "country": (5.0, 18.0)}
-_SIDE_STREETS = {"city": 2.0, "suburb": 2.2, "country": 0.5}  # how many on average
+_SETBACK_M = {"city": (0.0, 2.5), "suburb": (1.5, 6.5), "country": (5.0, 18.0)}
+_SIDE_STREETS = {"city": 2.4, "suburb": 2.4, "country": 0.5}  # how many on average
+_WIDE_CHANCE = {"city": 0.15, "suburb": 0.06, "country": 0.0}  # of more lanes, bays across, or a strip in between
+_WIDER_M = (2.5, 9.0)
+_OPEN_CHANCE = {"city": 0.08, "suburb": 0.05, "country": 0.0}  # of a square: houses far back on one side
+_OPEN_M = (10.0, 45.0)
 _SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)}
 _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
 _VIEWPOINT_SPACING_M = 6.0  # at most, along our car's way
@@ -241,11 +245,13 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
     """Sample roads and ground of one theme."""
     kind = str(rng.choice(["suburb", "city", "country"], p=[0.52, 0.38, 0.10])) if theme == "mixed" else theme
     lanes = 2 if kind == "country" or rng.random() < {"city": 0.8, "suburb": 0.5}[kind] else 1
-    lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.15, 1.35))
+    lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.25, 1.6))
     parked = rng.random(2) < _PARK_CHANCE[kind]
     edge = lane * lanes / 2 + np.where(parked, _PARKING_M, rng.uniform(0.15, 0.4, 2))
     close = 0.15 if kind == "suburb" and rng.random() < 0.2 else 1.0  # streets without front gardens
     setback = close * rng.uniform(*_SETBACK_M[kind], 2)
+    edge += np.where(rng.random(2) < _WIDE_CHANCE[kind], rng.uniform(*_WIDER_M, 2), 0.0)
+    setback += np.where(rng.random(2) < _OPEN_CHANCE[kind], rng.uniform(*_OPEN_M, 2), 0.0)
     pavement = rng.uniform(*_PAVEMENT_M[kind], 2)
     streets = _sample_side_streets(rng, kind)
     bridge = rng.uniform(14, 70) * rng.choice([-1, 1]) if rng.random() < 0.06 else np.inf
@@ -260,13 +266,13 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
         parked=(bool(parked[0]), bool(parked[1])),
         pavement_m=(float(pavement[0]), float(pavement[1])),
         setback_m=(float(setback[0]), float(setback[1])),
-        our_v_m=-lane / 2 + rng.normal(0, 0.12) if lanes == 2 else rng.uniform(-0.2, 0.2),
+        our_v_m=-lane / 2 * rng.uniform(0.7, 1.02) if lanes == 2 else rng.uniform(-0.2, 0.2),
         side_streets=streets,
         bridge_u_m=float(bridge),
         line=_sample_line(rng, kind),
         waves=_sample_waves(rng),
-        tilt=rng.normal(0, 0.015, 2),
-        camber=rng.uniform(0.005, 0.025),
+        tilt=rng.normal(0, 0.016, 2),
+        camber=rng.uniform(0.005, 0.035),
         banks_m=(rng.normal(0.2, 1.0), rng.normal(0.2, 1.0)) if wild else (0.0, 0.0),
         level_m=(0.0, -0.03) if wild else (rng.uniform(0.06, 0.15), rng.uniform(0.1, 0.25)),
         speed_m_s=0.0 if rng.random() < 0.15 else float(rng.uniform(*_SPEED_M_S[kind])),
@@ -285,13 +291,13 @@ def _sample_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStree
 
 
 def _sample_line(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """Sample a gentle arc, in half of the streets with a bend or two."""
+    """Sample a gentle arc, in most streets with a bend or two."""
     u = np.arange(-260.0, 261.0, 2.0)
     yaw = rng.normal(0, 0.0012) * u
     for side in (-1, 1):
-        if rng.random() < (0.45 if kind != "country" else 0.7):
+        if rng.random() < (0.6 if kind != "country" else 0.7):
             at, length = side * rng.uniform(22, 85), rng.uniform(10, 25)
-            yaw += rng.uniform(-0.6, 0.6) * (np.tanh((u - at) / length) + side)
+            yaw += rng.uniform(-0.75, 0.75) * (np.tanh((u - at) / length) + side)
     middle = (yaw[1:] + yaw[:-1]) / 2
     steps = np.stack((np.cos(middle), np.sin(middle)), axis=1) * 2.0
     xy = np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
@@ -303,5 +309,5 @@ def _sample_waves(rng: np.random.Generator) -> np.ndarray:
     """Sample waves of the ground whose slopes have a spread of about one in sixty each."""
     length, turn = np.exp(rng.uniform(np.log(45), np.log(260), 4)), rng.uniform(0, 2 * np.pi, 4)
     number = 2 * np.pi / length
-    amplitude = rng.normal(0, 0.012, 4) / number
+    amplitude = rng.normal(0, 0.016, 4) / number
     return np.column_stack((amplitude, number * np.cos(turn), number * np.sin(turn), rng.uniform(0, 2 * np.pi, 4)))

@@ -1,212 +1,207 @@
-"""Cars, vans and trucks: kinds and places → bodies lofted over cross-sections, with glass, wheels and plates."""
+"""Vehicles: body types → kept shapes lofted over cubic profiles; kinds and places → objects of these shapes."""
+
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
+from scipy.interpolate import PchipInterpolator
 
-from lidargrit.scans import classes
 from lidargrit.simulator import materials
+from lidargrit.simulator.mesh import Shape
+from lidargrit.simulator.scene.body_types import BODY_TYPES, BUS, LORRY, PANEL_VAN, SHARES, BodyType
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
-from lidargrit.simulator.scene.shapes import boxes, fans, loft, quads, rows_of, tubes
+from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, fans, lathe, loft, quads
 
-HATCHBACK, SALOON, ESTATE, SUV, VAN, TRUCK = range(6)
-_SIZE_M = np.array(  # length, width, height: middle of the class; after data sheets of common cars, in round numbers
-    [(4.05, 1.74, 1.48), (4.60, 1.80, 1.45), (4.65, 1.80, 1.48), (4.45, 1.85, 1.68), (5.2, 1.95, 2.1), (7.6, 2.4, 2.6)]
-)
-_SPREAD = np.array([(0.07, 0.02, 0.03)] * 4 + [(0.1, 0.02, 0.12), (0.12, 0.02, 0.05)])
-# Fourteen cross-sections: share of the length behind the nose, and of the height at the roof or bonnet line.
-_BEHIND_NOSE = np.array(
-    [
-        (0, 0.02, 0.08, 0.20, 0.27, 0.44, 0.50, 0.545, 0.58, 0.74, 0.86, 0.965, 0.985, 1),
-        (0, 0.02, 0.08, 0.20, 0.27, 0.42, 0.47, 0.515, 0.545, 0.64, 0.70, 0.84, 0.97, 1),
-        (0, 0.02, 0.07, 0.18, 0.25, 0.39, 0.45, 0.50, 0.53, 0.74, 0.91, 0.975, 0.99, 1),
-        (0, 0.02, 0.06, 0.18, 0.24, 0.36, 0.42, 0.48, 0.515, 0.74, 0.91, 0.975, 0.99, 1),
-        (0, 0.02, 0.05, 0.11, 0.14, 0.27, 0.32, 0.36, 0.40, 0.60, 0.97, 0.985, 0.99, 1),
-        (0, 0.01, 0.015, 0.02, 0.03, 0.06, 0.09, 0.14, 0.18, 0.21, 0.24, 0.25, 0.60, 1),
-    ]
-)
-_TOP = np.array(
-    [
-        (0.36, 0.50, 0.58, 0.64, 0.67, 0.95, 1, 1, 1, 0.98, 0.93, 0.66, 0.56, 0.38),
-        (0.38, 0.50, 0.58, 0.64, 0.67, 0.95, 1, 1, 1, 0.99, 0.96, 0.70, 0.66, 0.42),
-        (0.38, 0.50, 0.58, 0.64, 0.67, 0.95, 1, 1, 1, 1, 0.96, 0.68, 0.56, 0.40),
-        (0.42, 0.55, 0.62, 0.66, 0.68, 0.95, 1, 1, 1, 1, 0.97, 0.66, 0.58, 0.42),
-        (0.30, 0.40, 0.48, 0.54, 0.57, 0.94, 0.99, 1, 1, 1, 0.99, 0.97, 0.90, 0.25),
-        (0.34, 0.42, 0.48, 0.50, 0.52, 0.92, 0.95, 0.95, 0.95, 0.95, 0.93, 0.32, 0.32, 0.30),
-    ]
-)
-_BELT = np.array([0.64, 0.65, 0.65, 0.66, 0.55, 0.50])
-_FULLNESS = np.array([0.74, 0.88, 0.96, 1, 1, 1, 1, 1, 1, 1, 0.99, 0.96, 0.91, 0.80])  # of the width, from above
-_WINDSCREEN, _REAR_SCREEN, _SIDE_PANES = 4, 10, (5, 6, 8, 9)
-# Farther away some sections, and the sill, middle, belt and roof of each, tell the same.
-_FAR_SECTIONS, _FAR_POINTS, _FAR_FACES = (0, 1, 4, 5, 8, 10, 11, 12, 13), (1, 2, 3, 4), (0, 2, 3, 5, 7, 8, 9, 11)
-_DETAIL_TO_M = 27.0  # beams lie 0.1 by 0.2 m apart there: wheels and seats are a pixel or two
-_AXLES = np.array([(0.19, 0.80)] * 4 + [(0.17, 0.78), (0.13, 0.76)])
-_LABELS = np.array([classes.CAR] * 5 + [classes.TRUCK])
-_MOVING = np.array([classes.MOVING_CAR] * 5 + [classes.MOVING_TRUCK])
+VARIANTS = 10  # of each body type
+_PAINT, _GLASS, _RUBBER, _METAL, _DARK, _PLATE, _CARGO = range(7)
+_MATERIALS = (materials.PAINT, materials.GLASS, materials.RUBBER, materials.METAL, materials.CLOTH, materials.FOIL,
+              materials.PAINT)  # fmt: skip
+# Half a cross-section from the sill up: share of the half width, and of the height from the sill to the belt.
+_FLANK_WIDTH = np.array([0.90, 0.965, 0.995, 1.0, 0.985, 0.965])
+_FLANK_HEIGHT = np.array([0.0, 0.10, 0.35, 0.6, 0.85, 1.0])
+_PANE = np.array([0.06, 0.5, 0.9, 1.0])  # share of the way from the belt to the edge of the roof
+_ROOF_WIDTH, _ROOF_HEIGHT = np.array([0.72, 0.36, 0.0]), np.array([0.6, 0.93, 1.0])
+_PANE_BANDS, _SCREEN_BANDS = (6, 7), (9, 10, 11)
+_CROWN_M = 0.06  # from the edge of the roof to its middle
 
 
-def sample_vehicle_kinds(rng: np.random.Generator, count: int, trucks: float = 0.03) -> Int[np.ndarray, " n"]:
-    """Sample what kinds of vehicle stand or drive in a European street."""
-    shares = np.array([0.36, 0.2, 0.22, 0.12, 0.10, 0.0]) * (1 - trucks)
-    shares[TRUCK] = trucks
-    return rng.choice(6, count, p=shares)
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """One vehicle's own measures: a body type with the chances of a variant."""
+
+    kind: BodyType
+    length_m: float
+    width_m: float
+    height_m: float
+
+    def x_m(self, behind_nose: np.ndarray | float) -> np.ndarray:
+        return self.length_m * (0.5 - np.asarray(behind_nose, np.float64))
+
+    @property
+    def arch_m(self) -> float:
+        return self.kind.wheel_m + 0.06
+
+    def outline(self, behind: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the heights of sill, belt and roof and half the width at stations; arches cut into the sill."""
+        kind = self.kind
+        top = self.height_m * PchipInterpolator(*np.array(kind.top).T)(behind)
+        half = self.width_m / 2 * PchipInterpolator(*np.array(kind.plan).T)(behind)
+        belt = self.height_m * np.interp(behind, (0.0, 1.0), kind.belt)
+        low = kind.clearance_m + 0.10 * np.clip(1 - behind / 0.06, 0, 1) + 0.14 * np.clip((behind - 0.93) / 0.07, 0, 1)
+        for axle in kind.axles:
+            apart = self.length_m * (behind - axle)
+            inside = np.abs(apart) < self.arch_m
+            arch = kind.wheel_m + np.sqrt(np.maximum(self.arch_m**2 - apart**2, 0))
+            low = np.where(inside, np.maximum(low, arch), low)
+        belt = np.minimum(belt, top - _CROWN_M - 0.012)
+        return low, np.maximum(belt, low + 0.02), top, half
+
+    def stations(self) -> np.ndarray:
+        """Return shares of the length behind the nose: an even row, the profiles' knots, and dense ones at arches."""
+        reach = self.arch_m / self.length_m
+        arches = [axle + reach * np.cos(np.linspace(0.0, np.pi, 11)) for axle in self.kind.axles]
+        panes = [np.array(span) for span in (*self.kind.windows, self.kind.windscreen, self.kind.rear_screen)]
+        every = np.unique(np.concatenate([np.linspace(0, 1, 26), *(k[0] for k in [np.array(self.kind.top).T]),
+                                          *arches, *panes]))  # fmt: skip
+        every = every[(every >= 0) & (every <= 1)]
+        return every[np.concatenate(([True], np.diff(every) > 0.0015))]
+
+
+def _skin(builder: ShapeBuilder, body: _Body) -> None:
+    """Loft the body over its stations; panes lie between belt and roof, at intervals that leave the pillars."""
+    behind = body.stations()
+    low, belt, top, half = body.outline(behind)
+    edge = top - _CROWN_M
+    cabin = edge - belt
+    shoulder = half * _FLANK_WIDTH[-1]
+    roof = np.maximum(shoulder - body.kind.tumble * cabin - 0.02, 0.25 * shoulder)
+    y = np.concatenate((half[:, None] * _FLANK_WIDTH, shoulder[:, None] + (roof - shoulder)[:, None] * _PANE,
+                        roof[:, None] * _ROOF_WIDTH), axis=1)  # fmt: skip
+    z = np.concatenate((low[:, None] + (belt - low)[:, None] * _FLANK_HEIGHT, belt[:, None] + cabin[:, None] * _PANE,
+                        edge[:, None] + _CROWN_M * _ROOF_HEIGHT), axis=1)  # fmt: skip
+    x = np.broadcast_to(body.x_m(behind)[:, None], y.shape)
+    left = np.stack((x, y, z), axis=-1)
+    middle = (behind[1:] + behind[:-1]) / 2
+    glass = np.zeros((len(middle), left.shape[1] - 1), bool)
+    high = np.minimum(cabin[1:], cabin[:-1]) > 0.1
+    for start, stop in body.kind.windows:
+        glass[:, _PANE_BANDS] |= ((middle > start) & (middle < stop) & high)[:, None]
+    for start, stop in (body.kind.windscreen, body.kind.rear_screen):
+        glass[:, _SCREEN_BANDS] |= ((middle > start) & (middle < stop))[:, None]
+    for side in (1, -1):
+        strip = left * np.array([1, side, 1])
+        quad = np.stack((strip[:-1, :-1], strip[1:, :-1], strip[1:, 1:], strip[:-1, 1:]), axis=2)
+        builder.add(_PAINT, quads(quad[~glass]))
+        builder.add(_GLASS, quads(quad[glass]))
+    ends = np.concatenate((left, left[:, ::-1] * np.array([1, -1, 1])), axis=1)[[0, -1]]
+    builder.add(_PAINT, fans(ends))
+
+
+def _running_gear(builder: ShapeBuilder, body: _Body) -> None:
+    """Stand tyres with rims on the ground in wells that are closed inwards, and hang a floor between them."""
+    kind, radius = body.kind, body.kind.wheel_m
+    wide = 0.115 if radius < 0.42 else 0.16  # half the width of a tyre
+    tyre = lathe(radius * np.array([0.62, 0.7, 0.96, 1.0, 1.0, 0.96, 0.6]),
+                 wide * np.array([0.8, 1.0, 1.0, 0.7, -0.7, -1.0, -1.0]), sides=24)  # fmt: skip
+    rim = lathe(radius * np.array([0.0, 0.25, 0.45, 0.63]), wide * np.array([0.75, 0.85, 0.5, 0.8]), sides=14)
+    turn = np.linspace(0, np.pi, 12)
+    for axle in kind.axles:
+        at = np.array([body.x_m(axle), 0.0, radius])
+        for side in (-1, 1):
+            hub = at + np.array([0, side * (body.width_m / 2 - wide - 0.02), 0])
+            for part, wheel in ((_RUBBER, tyre), (_METAL, rim)):  # the axis of the lathe becomes the axle
+                builder.add(part, np.stack((wheel[..., 0], side * wheel[..., 2], wheel[..., 1]), axis=-1) + hub)
+            arc = at + body.arch_m * np.stack((np.cos(turn), 0 * turn, np.sin(turn)), axis=1)
+            outer, inner = (arc + np.array([0, side * (body.width_m / 2 - deep), 0]) for deep in (0.02, 0.36))
+            well = np.stack((outer[:-1], outer[1:], inner[1:], inner[:-1]), axis=1)
+            builder.add(_DARK, quads(well))
+            foot = inner[[0, -1]] - np.array([0, 0, radius - kind.clearance_m])
+            builder.add(_DARK, fans(np.concatenate((foot[:1], inner, foot[1:]))))
+    ends, half = body.x_m(np.array([0.97, 0.03])), body.width_m * 0.32
+    builder.add(_DARK, boxes(np.array([ends[0], -half, kind.clearance_m]),
+                             np.array([ends[1], half, kind.clearance_m + 0.1])))  # fmt: skip
+
+
+def _cabin(builder: ShapeBuilder, body: _Body) -> None:
+    """Put a dashboard, seats with heads and a floor behind the panes, mirrors outside, and plates at the ends."""
+    kind = body.kind
+    belt = body.height_m * kind.belt[0]
+    half = body.width_m * 0.40
+    for row in kind.seats:
+        back = float(body.x_m(row))
+        for y in (-half / 2 - 0.03, half / 2 + 0.03):
+            low, high = np.array([back - 0.12, y - 0.24, belt - 0.5]), np.array([back, y + 0.24, belt + 0.16])
+            builder.add(_DARK, boxes(low, high))
+            builder.add(_DARK, boxes(np.array([back - 0.11, y - 0.13, belt + 0.18]),
+                                     np.array([back - 0.02, y + 0.13, belt + 0.38])))  # fmt: skip
+    start, stop = max(kind.windows[0][0] - 0.06, 0.03), max(span[1] for span in (*kind.windows, kind.rear_screen))
+    floor = boxes(np.array([body.x_m(stop), -half, 0.42]), np.array([body.x_m(start), half, belt - 0.3]))
+    builder.add(_DARK, floor)
+    mirror = kind.windows[0][0] + 0.02
+    for side in (-1, 1):
+        corner = np.array([body.x_m(mirror) - 0.07, side * (body.width_m / 2 + 0.09) - 0.09, belt + 0.0])
+        builder.add(_PAINT, boxes(corner, corner + np.array([0.1, 0.18, 0.14 if kind.seats[0] > 0.3 else 0.3])))
+    for end, low in ((1, 0.42), (-1, 0.52 if kind.wheel_m < 0.42 else 0.6)):  # 0.52 x 0.11 m as in Europe
+        x = end * (body.length_m / 2 + 0.015)
+        corners = [(x, y, z) for y, z in ((-0.26, low), (0.26, low), (0.26, low + 0.11), (-0.26, low + 0.11))]
+        builder.add(_PLATE, quads(np.array(corners)))
+
+
+def _cargo(builder: ShapeBuilder, body: _Body) -> None:
+    """Put the box of a lorry on its frame."""
+    half, nose, tail = body.width_m / 2, float(body.x_m(0.29)), float(body.x_m(1.0))
+    corner = np.array([-0.5, -0.47, 0.47, 0.5, 0.5, 0.47, -0.47, -0.5]) * 2 * half
+    edge = np.array([0.0, 0.0, 0.0, 0.05, 0.96, 1.0, 1.0, 0.96])
+    ring = np.stack((0 * corner, corner, 1.05 + (body.height_m - 1.05) * edge), axis=1)
+    rings = ring + np.stack((np.linspace(tail, nose, 6), np.zeros(6), np.zeros(6)), axis=1)[:, None]
+    builder.add(_CARGO, loft(rings[None]))
+    builder.add(_CARGO, fans(rings[[0, -1]]))
+    builder.add(_DARK, boxes(np.array([tail, -0.45, 0.6]), np.array([nose, 0.45, 1.05])))
+    for side in (-1, 1):  # the guard between the axles, and the lamps' beam behind
+        y = side * (half - 0.08)
+        rail = boxes(np.array([body.x_m(0.62), y - 0.03, 0.45]), np.array([body.x_m(0.34), y + 0.03, 0.85]))
+        builder.add(_METAL, rail)
+
+
+@cache
+def vehicle_shape(kind: int, variant: int) -> Shape:
+    """Return one vehicle of a body type; it is made once, from a seed of its own."""
+    rng, body_type = np.random.default_rng((71, kind, variant)), BODY_TYPES[kind]
+    stretch = 1 + np.array(body_type.spread) * np.clip(rng.normal(size=3), -1.6, 1.6)
+    body = _Body(body_type, *(float(size) for size in np.array(body_type.size_m) * stretch))
+    builder = ShapeBuilder(*_MATERIALS)
+    _skin(builder, body)
+    _running_gear(builder, body)
+    _cabin(builder, body)
+    if kind == LORRY:
+        _cargo(builder, body)
+    return builder.build()
+
+
+def sample_vehicle_kinds(rng: np.random.Generator, count: int, large: float = 0.03) -> Int[np.ndarray, " n"]:
+    """Sample what kinds of vehicle stand or drive in a European street; ``large`` is the share of lorries and buses."""
+    shares = np.array(SHARES) * (1 - large)
+    shares[[LORRY, BUS]] = 0.6 * large, 0.4 * large
+    return rng.choice(len(BODY_TYPES), count, p=shares / shares.sum())
 
 
 def make_vehicles(
-    rng: np.random.Generator,
-    kinds: Int[np.ndarray, " n"],
-    placements: Placements,
-    first_instance: int,
-    away_m: Float[np.ndarray, " n"],
-) -> list[ObjectBatch]:
-    """Sample vehicles of given kinds; far ones are cruder, and trucks come with a box that is an object of its own."""
+    rng: np.random.Generator, kinds: Int[np.ndarray, " n"], placements: Placements, first_instance: int
+) -> ObjectBatch:
+    """Sample vehicles of given kinds: a shape, a colour and an instance each."""
     count = len(kinds)
-    size = _SIZE_M[kinds] * (1 + _SPREAD[kinds] * np.clip(rng.normal(size=(count, 3)), -1.6, 1.6))
-    length, width, height = size.T
+    shapes = tuple(vehicle_shape(int(k), int(v)) for k, v in zip(kinds, rng.integers(0, VARIANTS, count), strict=True))
     dark = rng.random(count) < 0.5
     paint = np.where(dark, np.exp(rng.uniform(np.log(0.002), np.log(0.05), count)), rng.uniform(0.05, 0.4, count))
-    seats, metal = rng.uniform(0.03, 0.12, (count, 1)), rng.uniform(0.1, 0.4, (count, 1))
+    paint = np.where(kinds >= PANEL_VAN, np.maximum(paint, rng.uniform(0.02, 0.4, count)), paint)
+    albedo = np.empty((count, len(_MATERIALS)), np.float32)
+    albedo[:, _PAINT], albedo[:, _GLASS], albedo[:, _RUBBER], albedo[:, _PLATE] = paint, 0.02, 0.03, 0.5
+    albedo[:, _METAL], albedo[:, _DARK] = rng.uniform(0.1, 0.4, count), rng.uniform(0.02, 0.08, count)
+    albedo[:, _CARGO] = rng.uniform(0.1, 0.5, count)
+    moves = placements.speed_m_s != 0
+    label = [np.full(len(_MATERIALS), BODY_TYPES[kind].moving if go else BODY_TYPES[kind].label, np.uint16)
+             for kind, go in zip(kinds, moves, strict=True)]  # fmt: skip
+    size = 1 + 0.012 * np.clip(rng.normal(size=(count, 3)), -1.5, 1.5)
     instance = np.arange(first_instance, first_instance + count, dtype=np.int32)
-    label = np.where(placements.speed_m_s != 0, _MOVING[kinds], _LABELS[kinds])
-    groups = []
-    for far in (False, True):
-        some = np.flatnonzero((away_m > _DETAIL_TO_M) == far)
-        if not len(some):
-            continue
-        kind, (long, wide, tall) = kinds[some], size[some].T
-        body, glazed = _body(kind, long, wide, tall, far)
-        parts = [
-            (body, np.where(glazed, materials.GLASS, materials.PAINT), np.where(glazed, 0.02, paint[some, None])),
-            (_plates(long, wide), materials.FOIL, 0.5),
-            (_wheels(kind, long, wide, tall, far), materials.RUBBER, 0.03),
-            (_inside(kind, long, wide, tall, far), materials.CLOTH, seats[some]),
-            (_rims(kind, long, wide, tall, far), materials.METAL, metal[some]),
-        ]
-        groups.append(_object_batch(parts, label[some], instance[some], placements.select(some)))
-    trucks = np.flatnonzero(kinds == TRUCK)
-    if len(trucks):
-        high = np.maximum(height[trucks] * rng.uniform(1.05, 1.45, len(trucks)), 2.6)
-        half, nose = width[trucks] / 2 + 0.06, length[trucks] / 2
-        cargo = boxes(rows_of(-nose, -half, 0.9), rows_of(nose - 0.26 * length[trucks], half, high))
-        part = (cargo, materials.PAINT, rng.uniform(0.1, 0.5, (len(trucks), 1)))
-        groups.append(_object_batch([part], label[trucks], instance[trucks], placements.select(trucks)))
-    return groups
-
-
-def _object_batch(parts: list[tuple], label: np.ndarray, instance: np.ndarray, placements: Placements) -> ObjectBatch:
-    shapes = [part[0].shape[:2] for part in parts]
-    local = np.concatenate([part[0] for part in parts], axis=1)
-    material = np.concatenate([np.broadcast_to(p[1], s) for p, s in zip(parts, shapes, strict=True)], axis=1)
-    albedo = np.concatenate([np.broadcast_to(p[2], s) for p, s in zip(parts, shapes, strict=True)], axis=1)
-    labelled = np.broadcast_to(label[:, None], local.shape[:2])
-    return ObjectBatch(
-        local.astype(np.float32),
-        material.astype(np.uint8),
-        albedo.astype(np.float32),
-        labelled.astype(np.uint16),
-        instance,
-        placements,
-    )
-
-
-def _body(
-    kinds: np.ndarray, length: np.ndarray, width: np.ndarray, height: np.ndarray, far: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the skins (n, t, 3, 3), nose at +x, and which of their triangles are glass."""
-    count = len(kinds)
-    x = length[:, None] * (0.5 - _BEHIND_NOSE[kinds])  # (n, 14)
-    top = height[:, None] * _TOP[kinds]
-    belt = np.minimum((height * _BELT[kinds])[:, None], top - 0.04)
-    half = width[:, None] / 2 * _FULLNESS
-    boxy = kinds[:, None] >= VAN
-    cabin = top > belt + 0.08
-    roof_half = half * np.where(cabin, np.where(boxy, 0.88, 0.75), 0.86)
-    low = np.full_like(x, 0.2) + 0.12 * boxy + np.where(np.arange(14) % 13 == 0, 0.12, 0.0)
-    edge = np.where(cabin, 0.05, 0.015)
-    profile = [  # half a cross-section, from the sill up: y and z
-        (0.90 * half, low),
-        (0.99 * half, low + 0.14),
-        (half, (belt + low) / 2),
-        (0.965 * half, belt),
-        (roof_half, top - edge),
-        (0.5 * roof_half, top),
-    ]
-    if far:
-        profile[1], profile[4] = (0.99 * half, low), (roof_half, top)
-        profile = [profile[point] for point in _FAR_POINTS]
-    left = np.stack([np.stack((x, y, z), axis=-1) for y, z in profile], axis=2)  # (n, 14, 6, 3)
-    right = left[:, :, ::-1] * np.array([1, -1, 1])
-    rings = np.concatenate((left, right), axis=2)
-    glass = np.zeros((count, 13, 12), bool)
-    glass[:, _WINDSCREEN, 4:7] = True
-    glass[:, _REAR_SCREEN, 4:7] = (kinds < VAN)[:, None]
-    for pane in _SIDE_PANES:
-        glass[:, pane, 3:8:4] = ((kinds < VAN) | (pane < 7))[:, None]
-    if far:
-        rings = rings[:, _FAR_SECTIONS]
-        glass = glass[:, _FAR_SECTIONS[:-1]][:, :, _FAR_FACES]
-    skin, ends = loft(rings)[:, :, :-1], fans(rings[:, [0, -1]])  # nobody looks at cars from below
-    glass = np.repeat(glass[:, :, :-1].reshape(count, -1), 2, axis=1)
-    body = np.concatenate((skin.reshape(count, -1, 3, 3), ends.reshape(count, -1, 3, 3)), axis=1)
-    return body, np.pad(glass, ((0, 0), (0, body.shape[1] - glass.shape[1])))
-
-
-def _inside(kinds: np.ndarray, length: np.ndarray, width: np.ndarray, height: np.ndarray, far: bool) -> np.ndarray:
-    """Return what is seen through the glass: a block up to the belt, and a row of seats or two."""
-    belt = _BELT[kinds] * height
-    half, short = width * 0.42, kinds == TRUCK
-    front, back = length * np.where(short, 0.46, 0.24), -length * np.where(short, -0.28, 0.36)
-    floor = boxes(rows_of(back, -half, 0.4), rows_of(front, half, belt - 0.1))
-    seat = np.where(short, 0.36 * length, np.where(kinds == VAN, 0.19 * length, -0.03 * length))
-    top = belt + 0.55 * (height - belt)
-    first = boxes(rows_of(seat - 0.15, -half * 0.8, belt - 0.2), rows_of(seat, half * 0.8, top))
-    second = seat - np.where(kinds >= VAN, 0.05, 0.9)
-    rear = boxes(rows_of(second - 0.15, -half * 0.8, belt - 0.2), rows_of(second, half * 0.8, top - 0.05))
-    if far:  # the top of the block and one face of each row
-        return np.concatenate((floor[:, 10:], first[:, :2], rear[:, :2]), axis=1)
-    return np.concatenate((floor, first, rear), axis=1)
-
-
-def _plates(length: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return number plates, 0.52 x 0.11 m as in Europe, just before the nose and behind the tail."""
-    faces = []
-    for end, low in ((1, 0.42), (-1, 0.62)):
-        x = end * (length / 2 + 0.015)
-        corners = [rows_of(x, y, z) for y, z in ((-0.26, low), (0.26, low), (0.26, low + 0.11), (-0.26, low + 0.11))]
-        faces.append(quads(np.stack(corners, axis=1)))
-    return np.concatenate(faces, axis=1)
-
-
-def _hubs(
-    kinds: np.ndarray, length: np.ndarray, width: np.ndarray, height: np.ndarray, out_m: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the middles (n, 4, 3) of discs ``out_m`` outside the body, one for each wheel, and the wheels' radii."""
-    radius = np.where(kinds == TRUCK, 0.46, np.clip(0.21 * height, 0.29, 0.36))
-    hubs = np.empty((len(kinds), 4, 3))
-    hubs[..., 0] = (length[:, None] * (0.5 - _AXLES[kinds]))[:, [0, 0, 1, 1]]
-    hubs[..., 1] = (width / 2 + out_m)[:, None] * np.array([-1, 1, -1, 1])
-    hubs[..., 2] = radius[:, None]
-    return hubs, radius
-
-
-def _wheels(kinds: np.ndarray, length: np.ndarray, width: np.ndarray, height: np.ndarray, far: bool) -> np.ndarray:
-    outer, radius = _hubs(kinds, length, width, height, 0.01)
-    if far:
-        return fans(_rounds(outer, radius, 6)).reshape(len(kinds), -1, 3, 3)
-    inner, _ = _hubs(kinds, length, width, height, -0.22)
-    every = np.repeat(radius, 4)
-    tyres = tubes(inner.reshape(-1, 3), outer.reshape(-1, 3), every, every, sides=10)
-    return tyres.reshape(len(kinds), -1, 3, 3)
-
-
-def _rims(kinds: np.ndarray, length: np.ndarray, width: np.ndarray, height: np.ndarray, far: bool) -> np.ndarray:
-    hubs, radius = _hubs(kinds, length, width, height, 0.018)
-    discs = _rounds(hubs, 0.74 * radius, 4) if far else _rounds(hubs, 0.62 * radius, 8)  # of nearly the same area
-    return fans(discs).reshape(len(kinds), -1, 3, 3)
-
-
-def _rounds(middle: np.ndarray, radius: np.ndarray, corners: int) -> np.ndarray:
-    """Return upright rims (n, 4, corners, 3) that face sideways."""
-    turn = 2 * np.pi / corners * np.arange(corners)
-    rim = np.stack((np.cos(turn), 0 * turn, np.sin(turn)), axis=1)
-    return middle[:, :, None] + radius[:, None, None, None] * rim
+    return ObjectBatch(shapes, size, tuple(albedo), tuple(label), instance, placements, leans=True)

@@ -35,6 +35,7 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
 from lidargrit.simulator.power import RaydropModel
+from lidargrit.simulator.setups import setup_of
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
 from lidargrit.viewer.serve.requests import EXAMPLES, TASKS, UPSAMPLED, Example, SampleRequest, sampling_settings
@@ -190,8 +191,12 @@ def _read_scan(request: SampleRequest, generator: Generator, reader: ScanReader)
 
 def _example(example: Example, sensor: SensorModel) -> Scan:
     sensor = load_sensor(example.sensor) if example.sensor else sensor
-    beams = RaydropModel(least_power=_NO_POWER, gap_share=0.0) if example.every_beam_returns else RaydropModel()
-    return simulate(_EXAMPLE_SEED, sensor, model=beams)
+    if not example.every_beam_returns:
+        return simulate(_EXAMPLE_SEED, sensor)
+    setup = dataclasses.replace(
+        setup_of(sensor, np.random.default_rng(_EXAMPLE_SEED)), firing_jitter_rad=0.0, split_exponent=0.0
+    )
+    return simulate(_EXAMPLE_SEED, dataclasses.replace(sensor, setup=setup), model=RaydropModel(least_power=_NO_POWER))
 
 
 def _cure_on_the_page(request: SampleRequest, generator: Generator, scan: Scan) -> str:

@@ -9,6 +9,8 @@ from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints
 from lidargrit.scans.sensors import load_sensor
 
+STREETS_VERSION = 2
+"""Version of what a seed makes: 2 has set-ups of sensors, 1 had none; recordings tell it."""
 _SEEDS_APART = 1_000_000  # distance between the splits' first seeds, and so the largest count
 
 
@@ -72,8 +74,8 @@ class Streets(ScanDataset):
         return f"seed_{self.seeds[index]:07d}"
 
     def recording(self, index: int) -> str:
-        """Name the street of a scan by its seed, which no other scan shares."""
-        return f"simulated/{self.name(index)}"
+        """Name the street of a scan by the version of the streets and its seed, which no other scan shares."""
+        return f"simulated/streets {STREETS_VERSION}/{self.name(index)}"
 
     @classmethod
     def matches(cls, root: Path) -> bool:
