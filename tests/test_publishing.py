@@ -17,7 +17,7 @@ from PIL import Image
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core import configuration
-from lidargrit.core.files import write_json
+from lidargrit.core.files import sha256_of_json, write_json
 from lidargrit.data.datasets import data_set_and_split, load, open_dataset
 from lidargrit.data.datasets import folder as folder_of_scans
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
@@ -154,7 +154,9 @@ def test_scores_of_other_weights_and_taken_folders_are_refused(run, tmp_path, ca
     weights = json.loads(scores)["inputs"]["samples"]["weights_sha256"]
     moved = scores.replace(str(run.parent), "/elsewhere")  # as if they came from another machine
     for others in ("0" * 64, ""):  # the second of another program, which has no weights of ours
-        (tmp_path / "other.json").write_text(moved.replace(weights, others))
+        other = json.loads(moved.replace(weights, others))
+        del other["sha256"]  # its own, that of what was altered
+        (tmp_path / "other.json").write_text(json.dumps({**other, "sha256": sha256_of_json(other)}))
         assert "which were not sampled from" in error(run, tmp_path / "new", "--scores", tmp_path / "other.json")
     assert "then rounded" in error(run, tmp_path / "new", "--bits", "16", "--scores", run.parent / "scores.json")
     assert not (tmp_path / "new").exists()
