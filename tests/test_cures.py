@@ -103,13 +103,7 @@ def test_every_verb_that_reads_scans_is_here():
 
 
 def test_no_text_of_the_program_names_an_option_that_no_verb_has():
-    known = {
-        "--version",
-        "--print-completion",
-        "--no-python",
-        "--nproc-per-node",
-        "--head",
-    }  # torchrun's and ray's last
+    known = {"--version", "--print-completion", "--no-python", "--nproc-per-node", "--head"}  # of torchrun, ray
     for parser in PARSERS.values():
         known |= parser._option_string_actions.keys()
     for path in Path(lidargrit.__file__).parent.rglob("*.py"):
