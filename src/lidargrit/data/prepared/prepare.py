@@ -13,7 +13,7 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
 from lidargrit.core.errors import DataError, OutputError, counted_scans, no_usable_scan
-from lidargrit.core.files import claim_folder, is_taken, write_json, write_text
+from lidargrit.core.files import claim_folder, is_taken, sha256_of_json, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
@@ -58,8 +58,8 @@ def prepare(
     rank, world_size = rank_and_world_size(rank, world_size)
     dataset = open_dataset(source, config.bad_points) if dataset is None else dataset
     spec, scans = _spec(source, dataset, sensor, config)
-    facts = json.dumps({**asdict(spec), "source": ""}, sort_keys=True).encode()  # the digest names the scans
-    folder = folder or cache_folder() / hashlib.sha256(facts).hexdigest()[:24]
+    # By all but the source's name: the digest names the scans.
+    folder = folder or cache_folder() / sha256_of_json({**asdict(spec), "source": ""})[:24]
     _claim(folder, spec, scans)
     missing = PreparedFolder(str(folder)).missing(spec, range(spec.num_shards))
     if not missing:  # a complete folder may be one that this user can only read

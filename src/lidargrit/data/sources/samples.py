@@ -1,7 +1,5 @@
 """A folder of generated scans, one a file → their range images, and what it says of their model."""
 
-import hashlib
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +12,7 @@ from torch import Tensor
 from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, read_arrays, read_member
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import CheckpointError, ConfigError, DataError, ScanError
-from lidargrit.core.files import read_json
+from lidargrit.core.files import read_json, sha256_of_json
 from lidargrit.data.formats import open_file
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.scans.condition import Condition
@@ -62,7 +60,7 @@ def read_facts(folder: Path) -> SampleFacts:
         variant if isinstance(variant, str) else "",
         None if rows is None else range(*rows),
         weights if isinstance(weights, str) else "",
-        hashlib.sha256(json.dumps(made_by, sort_keys=True).encode()).hexdigest()[:8],
+        sha256_of_json(made_by)[:8],
     )
 
 
