@@ -97,12 +97,14 @@ def check_condition(
     sensor: SensorModel,
     name: str,
     first_command: str,
+    count: int | None = None,
 ) -> None:
     """Refuse a condition of a type that a generator does not take, or by other rays, and observations of other kinds.
 
     Args:
         kinds: kinds of observations that it takes.
         first_command: command of ``lidargrit`` by which a generator that takes others is used.
+        count: number of images that it is of; None where none are given.
     """
     if isinstance(condition, Observed):
         check_images(condition, sensor)
@@ -120,3 +122,6 @@ def check_condition(
     if isinstance(condition, Past) and not condition.sensor.same_rays(sensor):
         got = f"a past by the sensor {condition.sensor.name!r}, {condition.sensor.height}x{condition.sensor.width}"
         raise ConfigError(got, f"one on the generator's own rays, {sensor.height}x{sensor.width}", "project its scans")
+    if count not in (None, len(condition)):
+        got = f"a {type(condition).__name__} of {len(condition)} scans for {count} images"
+        raise ConfigError(got, "one for each image", "take as many of both")

@@ -249,7 +249,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             images: batch of range images (B, H, W).
             step_mm: step in whole millimetres that ranges are rounded to, as a real number has infinitely many bits.
             expected: whether the expected number of bits (the entropy) is computed, too, for :meth:`ScanBits.surprise`.
-            condition: what is known of each scan, for a generator whose likelihood depends on it, such as the past.
+            condition: condition of each scan, such as its past, for a generator whose likelihood depends on it.
 
         Raises:
             ConfigError: images of other rays, another step or condition, or a generator without the capability.
@@ -261,8 +261,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         rounded = one_by_one(steps.round(images.to(self.device)))
         if isinstance(condition, Nothing):
             return ScanBits.cat([self._bits(image, steps, expected) for image in rounded])
-        self._check_condition(condition)
-        check_seeds(range(len(images)), len(condition))
+        self._check_condition(condition, len(images))
         each = zip(rounded, (condition.to(self.device)[[at]] for at in range(len(images))), strict=True)
         return ScanBits.cat([self._bits_given(image, known, steps, expected) for image, known in each])
 
@@ -290,11 +289,11 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Return the bits under a condition; a generator whose likelihood depends on one overrides it."""
         raise ConfigError(f"a condition for the likelihood of {self.public_name()!r}", "scans alone", "leave it out")
 
-    def _check_condition(self, condition: Condition) -> None:
+    def _check_condition(self, condition: Condition, count: int | None = None) -> None:
         if isinstance(condition, Observed):
             self._require("complete")
         named, command = self.public_name(), self.facts.first_command
-        check_condition(condition, self.takes, self.conditions, self.sensor, named, command)
+        check_condition(condition, self.takes, self.conditions, self.sensor, named, command, count)
 
     def _completed(self, known: Observed, seeds: Sequence[int], sampling: SamplingT | None) -> RangeImage:
         """Complete each scan, by the bundle's run for what was observed of it if there is one."""

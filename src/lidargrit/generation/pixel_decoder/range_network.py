@@ -81,7 +81,7 @@ class RangeNetwork(PhaseNetwork):
         return_mask: Bool[Tensor, "B H W"],
         v: Float[Tensor, "B H W"],
         candidates: Float[Tensor, "P B K h w"],
-        decoded: Float[Tensor, "P B 3 D h w"] | None = None,
+        decoded: Float[Tensor, "P B 3 N h w"] | None = None,
     ) -> Float[Tensor, "P B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
         candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
