@@ -8,7 +8,7 @@ import pytest
 from lidargrit.core.errors import ConfigError
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
-from lidargrit.simulator.mesh import Finish, Mesh
+from lidargrit.simulator.mesh import Finish
 from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.body_types import BODY_TYPES
 from lidargrit.simulator.scene.layout import driving, parked
