@@ -83,11 +83,8 @@ def path_of(frames: int, path: Path | None = None) -> Way:
     times_s = known.times_s[0] + PERIOD_S * np.arange(frames)
     if not known.covers(times_s):
         lasts = known.times_s[-1] - known.times_s[0]
-        got, wanted = (
-            f"{frames} scans, {frames * PERIOD_S:.1f} s, along {path}, which lasts {lasts:.1f} s",
-            "its length",
-        )
-        raise ConfigError(got, wanted, f"take --frames {int(lasts / PERIOD_S) + 1}, or another path")
+        got = f"{frames} scans, {PERIOD_S:g} s apart, along {path}, which lasts {lasts:.1f} s"
+        raise ConfigError(got, "no more than its length", f"take --frames {int(lasts / PERIOD_S) + 1}, or another path")
     turns, places = known.at(times_s)
     poses = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
     poses[:, :3, :3], poses[:, :3, 3] = torch.from_numpy(turns.as_matrix()), torch.from_numpy(places)
