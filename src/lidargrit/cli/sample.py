@@ -11,7 +11,6 @@ from lidargrit.core.untrusted import seed_number, seeds_in_a_row, whole_number
 
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
-  lidargrit sample pretrained_wide samples -n 8           by another, 64x1024
   lidargrit sample runs/forecaster drives -n 2 --frames 100 --path poses.txt           two drives of ten seconds
   torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
@@ -41,20 +40,21 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
     from lidargrit.nn.devices import usable_device
 
-    seeds, run_folder = seeds_in_a_row(options.seed, options.count), locate(options.run_folder)
-    address, words, count = ray_address(options), sampling_words(options.set), options.count
+    seeds = seeds_in_a_row(options.seed, options.count)
+    address, words = ray_address(options), sampling_words(options.set)
     if address and options.frames:
-        raise ConfigError("--frames with --ray", "one of them", "leave --ray out: a drive is made scan after scan")
+        raise ConfigError("--frames with --ray", "one of them", "leave --ray out")
     if address:
-        write_samples_on_ray(run_folder, options.out, seeds, words, address, options.device)
+        write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
         rank, world_size = rank_and_world_size(options.rank, options.world_size)
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-        generator = load(run_folder).to(usable_device(options.device or own))
-        sampling, seeds = generator.parse_sampling(words), seeds[rank::world_size]
+        device, run_folder = usable_device(options.device or own), locate(options.run_folder)
+        generator, seeds = load(run_folder).to(device), seeds[rank::world_size]
+        sampling = generator.parse_sampling(words)
         if options.frames:
-            ways, path = [path_of(options.frames, options.path)] * len(seeds), str(options.path or "straight")
-            count = write_drives(generator, run_folder, options.out, ways, seeds, sampling, path=path)
+            ways = [path_of(options.frames, options.path)] * len(seeds)
+            write_drives(generator, run_folder, options.out, ways, seeds, sampling, path=str(options.path))
         else:
             write_samples(generator, run_folder, options.out, seeds, sampling)
-    print(f"done: {counted_scans(count)} in {options.out}; {look_at(options.out)}")
+    print(f"done: {counted_scans(len(seeds) * max(1, options.frames))} in {options.out}; {look_at(options.out)}")
