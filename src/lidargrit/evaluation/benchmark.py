@@ -339,7 +339,7 @@ class _Plan:
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings, benchmark: Benchmark
+    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings | None, benchmark: Benchmark
 ) -> tuple[int, float] | None:
     """Sample what is not there yet, and return how many scans and the seconds for each; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
