@@ -14,6 +14,7 @@ EXAMPLES = """\
   lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
   lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
   lidargrit evaluate kitti_360:/data/kitti_360:test --protocol r2dm --save-reference test.lgref    scores need no data
+  lidargrit evaluate kitti_odometry:drives:all --protocol forecast    drives: each scan from the five before it
   lidargrit evaluate --tables ours.json theirs.json --table markdown
 """
 
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
     add_device(parser)
     add_scans(parser)
-    add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
+    add("--model", default="", metavar="RUN", help="raydrop model (streets), or model that forecasts (forecast)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
     add(
         "--save-reference",
