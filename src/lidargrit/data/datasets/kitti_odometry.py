@@ -66,10 +66,11 @@ class KittiOdometry(FileDataset):
 
     @classmethod
     def origin_of(cls, root: Path) -> str:
-        """Return ``simulated`` for a tree of ``simulate``, "" for one of ``export``, and else see the base."""
+        """Return ``simulated`` for a tree of ``simulate``, "" for one of other verbs, and else see the base."""
         if (root / "simulated.json").is_file():
             return "simulated"
-        return "" if (root / "export.json").is_file() else super().origin_of(root)
+        ours = any((root / name).is_file() for name in ("export.json", "drive.json"))
+        return "" if ours else super().origin_of(root)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
