@@ -167,7 +167,7 @@ def load_preset(name: str, settings: Sequence[str] = ()) -> Preset:
         raise ConfigError(
             f"{name}, a folder that holds no finished run",
             "a preset, or where systems are compared a finished run or samples",
-            "see lidargrit list presets; score scans with lidargrit evaluate (--tables: side by side)",
+            "see lidargrit list presets; score scans with lidargrit evaluate",
         )
     is_generator = is_preset(name) and name not in discovery.names("presets")
     found = default_preset(name) if is_generator else discovery.load_instance("presets", name, Preset)
