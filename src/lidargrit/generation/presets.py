@@ -24,6 +24,7 @@ KITTI_360 = DataConfig(
     ("kitti_360:data/kitti_360:train_without_val",), ("kitti_360:data/kitti_360:val",), "hdl64e_kitti_360"
 )
 KITTI_ODOMETRY = DataConfig(("kitti_odometry:data/kitti_odometry:train",), ("kitti_odometry:data/kitti_odometry:val",))
+NUSCENES = DataConfig(("nuscenes:data/nuscenes:train",), ("nuscenes:data/nuscenes:val",), "hdl32e", columns=1024)
 
 KITTI_360_EPOCH = 50_000
 """Number of scans of the training drives, roughly."""

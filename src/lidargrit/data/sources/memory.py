@@ -33,7 +33,9 @@ class MemorySource(Source):
 
     def cut(self, num_points: int) -> Source:
         """Return the source with the first points of each scan alone."""
-        return MemorySource([_first_points(scan, num_points) for scan in self._scans], self._sensor)
+        found = MemorySource([_first_points(scan, num_points) for scan in self._scans], self._sensor)
+        found.doubts = (_told(self, num_points),)
+        return found
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans, or so many of them, evenly spaced."""
@@ -56,6 +58,7 @@ class CutSource(Source):
         super().__init__(source.text)
         self.data_set, self.split = source.data_set, source.split
         self._source, self._num_points = source, num_points
+        self.doubts = (_told(source, num_points),)
 
     @property
     def sensor(self) -> SensorModel:
@@ -76,6 +79,10 @@ class CutSource(Source):
             sensor or config.imaged(self.sensor),
             config,
         )
+
+
+def _told(source: Source, num_points: int) -> str:
+    return f"of each cloud of {source.text} the first {num_points:,} points alone are scored, as by that program"
 
 
 def _first_points(scan: Scan, num_points: int) -> Scan:

@@ -16,9 +16,9 @@ lidm = Protocol(
         "a fault of the program, kept: it moves points above +3 and below -25 degrees into its outer rows",
         "the distances between features of trained networks (FRID, FSVD, FPVD) are not built",
         "the program takes points from 1 m on; here those nearer than 1.45 m are left out, and hide what lies behind",
-        "a fault of its users, kept: released models mirror at random, so that samples have no front, and JSD and MMD "
-        "compare them with scans that have one",
-        "R3DPA's program takes these metrics of 10,000 samples, and its MMD has cells of 5 cm and not of 50, of 2,000 "
-        "samples and 1,000 scans: its MMD is another number, and is not built",
+        "the program puts the points of both sets on the edges of pixels, half a row and half a column away from their "
+        "centres; here both sets lie on the rays through the centres",
+        "a fault, kept: the released models learned from mirrored scans, so that their samples have no front, and are "
+        "compared with scans that have one",
     ),
 )

@@ -50,8 +50,7 @@ def project(
             would fit, or the projection.
 
     Source:
-        Haghighi et al., LidarGRIT, 2024, section 3.1; programs hamedhaghighi/LidarGRIT@a3f86e7,
-        kazuto1011/r2dm@ad66e71, vzyrianov/lidargen@4c3226c, worldbench/lidarcrafter@3c62da2.
+        Haghighi et al., LidarGRIT, 2024, section 3.1, and its program @a3f86e7; kazuto1011/r2dm@ad66e71.
     """
     nearest = _nearest(scan, sensor, method, variant, partial, refuse=True)
     point_of_pixel, range_m = (array[:, :: sensor.column_stride] for array in nearest)
