@@ -101,7 +101,9 @@ def test_of_clouds_the_first_26000_points_alone_are_scored(tmp_path):
     card, _ = compare_sources(*sets, settings)
     assert any("the first 26,000 points alone" in warning for warning in card.warnings)
     assert card.scores[0].result.value == pytest.approx(wanted, abs=2e-4), "prepared ranges are rounded to 2 mm"
-    in_memory = lidargrit.evaluate(*read.values(), "lidarcrafter", ["bev_jsd"], sensor=load_sensor("hdl32e_nuscenes"))
+    in_memory = lidargrit.evaluate(
+        read["samples"], read["real"], "lidarcrafter", ["bev_jsd"], sensor=load_sensor("hdl32e_nuscenes")
+    )
     assert in_memory.scores[0].result.value == pytest.approx(wanted, rel=1e-6)
     whole = sum(cells(pixels_of_the_program(cloud)) for cloud in read["samples"])
     assert abs(divergence_root(whole, sums[1]) - wanted) > 0.01, "the cut changes the score"

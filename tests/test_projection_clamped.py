@@ -34,7 +34,7 @@ def test_clamped_index_map_is_the_programs(golden, shared, name):
 def test_points_beyond_the_rows_and_the_limits_against_lidarcrafters_formulas():
     """Each point alone, so that a slow loop is enough; then two in one pixel."""
     sensor = load_sensor("hdl32e_nuscenes")
-    rng = np.random.default_rng(0)
+    rng, anchor = np.random.default_rng(0), [20.0, -30.0, 1.0]  # an image has at least one return
     for _ in range(200):
         elevation, azimuth = math.radians(rng.uniform(-40, 20)), rng.uniform(-math.pi, math.pi)
         range_m = rng.uniform(1, 90)
@@ -43,7 +43,6 @@ def test_points_beyond_the_rows_and_the_limits_against_lidarcrafters_formulas():
         height = 1 - (math.asin(point[2] / (range_m + 1e-6)) + math.radians(30)) / math.radians(40)
         row = min(max(math.floor(height * 32), 0), 31)
         column = math.floor((-math.atan2(point[1], point[0]) / math.pi + 1) / 2 % 1 * 1024)
-        anchor = [20.0, -30.0, 1.0]  # an image has at least one return
         image = project(Scan(torch.tensor([point, anchor])), sensor, variant="clamped")
         assert bool(image.return_mask[row, column]) is (1.45 <= range_m <= 80)
     hidden = project(Scan(torch.tensor([[1.0, 0, 0], [9.0, 0, 0], anchor])), sensor, variant="clamped")
