@@ -1,5 +1,6 @@
 """A generator that takes a past, and a way → generated scans in a row, each given the last ones, as KITTI sequences."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage
+from lidargrit.scans.types import RangeImage, Scan
 
 MANIFEST = "drive.json"
 PERIOD_S, _SPEED_M_S = 0.1, 10.0  # of a drive from nothing
@@ -190,7 +191,7 @@ class _Drive:
             if missing[frame]:
                 past = self._past(seen, way.poses[frame], time_s)
                 images = self._generator.sample([scan_seed(self._seed, frame)], past, self._sampling)
-                KittiBin.write(self._files[frame], unproject(images[0].to("cpu")))
+                KittiBin.write(self._files[frame], _as_fired(images[0].to("cpu")))
                 progress.advance(1)
             seen.append(Seen(self._written(self._files[frame]), way.poses[frame], time_s))
 
@@ -205,3 +206,13 @@ class _Drive:
     def _written(self, file: Path) -> Float[Tensor, "H fine_W"]:
         image = project(KittiBin.read(file), self._generator.sensor, "spherical")
         return in_fine_columns(RangeImage.stack([image]))[0]
+
+
+def _as_fired(image: RangeImage) -> Scan:
+    """Return the points of an image as KITTI's files have them: ring by ring, each counter-clockwise from ahead."""
+    scan = unproject(image)
+    assert scan.ring is not None  # which unproject tells
+    x, y = scan.points_xyz_m[:, :2].double().unbind(1)
+    turn = (torch.atan2(y, x) / (2 * math.pi)).remainder(1)
+    order = (scan.ring + turn).argsort(stable=True)
+    return Scan(scan.points_xyz_m[order], ring=scan.ring[order], source=scan.source)
