@@ -57,15 +57,15 @@ def named_sensor(options: argparse.Namespace, is_needed: bool, job: "Job" = "com
     """Return the sensor that the user named, else that of the source, which is told if guessed.
 
     Args:
-        is_needed: whether the model has no sensor of its own; a run has, which does ``job``, and refuses another.
+        is_needed: whether the model has no sensor of its own; a run has, which does ``job``, and refuses another unless
+            it takes any.
     """
     from lidargrit.data.sources import open_source
-    from lidargrit.data.sources.scan_sensor import refuse_other_sensor, sensor_for
+    from lidargrit.data.sources.scan_sensor import sensor_for, sensor_for_run
 
     settings = scan_settings(options)
     if not is_needed:
-        refuse_other_sensor(settings, options.model, job)
-        return None
+        return sensor_for_run(settings, options.scans, options.model, job)
     source = open_source(options.scans, settings.data.bad_points)
     return settings.data.imaged(sensor_for(source, settings.sensor))
 

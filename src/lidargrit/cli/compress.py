@@ -27,13 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.sources.scan_sensor import refuse_other_sensor
+    from lidargrit.data.sources.scan_sensor import sensor_for_run
     from lidargrit.inference.compress.command import compress_scans
 
     refuse_to_overwrite(options.out, options.overwrite, ".lgz")
     named = (options.scans, options.out, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
-    refuse_other_sensor(settings, options.model)
-    found = compress_scans(*named, settings.data)
+    found = compress_scans(*named, settings.data, sensor_for_run(settings, options.scans, options.model))
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
     print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

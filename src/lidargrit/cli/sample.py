@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words
 from lidargrit.cli._results import look_at
-from lidargrit.core.errors import counted_scans
+from lidargrit.core.errors import ConfigError, counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row
 
 EXAMPLES = """\
@@ -14,6 +14,7 @@ EXAMPLES = """\
   lidargrit sample pretrained_wide samples -n 8           by another, 64x1024
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set sampling.temperature=1.1 sampling.mask=threshold
+  lidargrit sample runs/any mine --sensor mine.json       by a run of the preset multiscale_any
   lidargrit sample runs/demo as_released -n 100 --set sampling.top_k=100
   torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
@@ -25,6 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
+    sensor = "name or .json of the sensor whose scans are sampled, by a run that takes any (default: the run's own)"
+    parser.add_argument("--sensor", default="", help=sensor)
     add_settings(parser, "settings of sampling, such as sampling.temperature=1.1; see: lidargrit list generators")
     add_rank(parser, "process")
     add_ray(parser)
@@ -35,6 +38,7 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from lidargrit.core.processes import rank_and_world_size
+    from lidargrit.data.prepared.config import ScanSettings
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
@@ -42,6 +46,10 @@ def run(options: argparse.Namespace) -> None:
 
     seeds = seeds_in_a_row(options.seed, options.count)
     address, words = ray_address(options), sampling_words(options.set)
+    reading = [word for word in options.set if word.startswith("data.")]
+    sensor = ScanSettings.read(reading, sensor=options.sensor).load_sensor()
+    if address and sensor is not None:
+        raise ConfigError(f"--sensor {options.sensor} with --ray", "one of them", "leave --ray out")
     if address:
         write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
@@ -49,6 +57,7 @@ def run(options: argparse.Namespace) -> None:
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
         device, run_folder = usable_device(options.device or own), locate(options.run_folder)
         generator = load(run_folder).to(device)
+        generator = generator if sensor is None else generator.for_sensor(sensor)
         seeds = seeds[rank::world_size]
         write_samples(generator, run_folder, options.out, seeds, generator.parse_sampling(words))
     print(f"done: {counted_scans(len(seeds))} in {options.out}; {look_at(options.out)}")

@@ -90,7 +90,7 @@ class PhaseNoise(nn.Module):
     def _places(self, phase: Phase, size: tuple[int, int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the places of a phase's rows and columns, in steps from one to the next of a typical sensor."""
         if self._given is None:
-            return tuple(range(size[0])), tuple(range(size[1]))
+            return tuple(map(float, range(size[0]))), tuple(map(float, range(size[1])))
         rows, step = self._given
         of_rows = tuple(row / (2 * phase.lattice.rows) for row in rows[phase.pixels[0]])
         return of_rows, tuple(step * column for column in range(size[1]))

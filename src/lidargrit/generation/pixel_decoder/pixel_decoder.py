@@ -262,7 +262,8 @@ class PixelDecoder(nn.Module):
         condition = condition.to(device) if condition else Observed.nothing(self.sensor, len(rngs), device)
         if absent := self.grid.height - self.sensor.height:
             maps = condition.range_m, condition.range_observed, condition.return_mask, condition.return_observed
-            condition = Observed(*(F.pad(each, (0, 0, 0, absent)) for each in maps), self.grid)
+            range_m, range_observed, mask, observed = (F.pad(each, (0, 0, 0, absent)) for each in maps)
+            condition = Observed(range_m, range_observed, mask, observed, self.grid)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if device.type == "cpu" else len(uniform)
         images = []

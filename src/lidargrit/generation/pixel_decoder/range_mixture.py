@@ -52,8 +52,8 @@ class RangeMixture:
 
     def without_last(self) -> "RangeMixture":
         """Return the distributions of all components but the last."""
-        parts = (part[..., :-1] for part in (self.logits, self.centres, self.log_scales))
-        return RangeMixture(*parts, self.limits_m)
+        logits, centres, log_scales = (part[..., :-1] for part in (self.logits, self.centres, self.log_scales))
+        return RangeMixture(logits, centres, log_scales, self.limits_m)
 
     def log_density(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
         """Return the natural logarithm of the probability density per metre."""

@@ -20,6 +20,36 @@ _ABSENT_APART_RAD = 1e-3
 _TYPICAL_STEP_RAD, _TYPICAL_HEIGHT_M, _TYPICAL_LIMITS_M = math.radians(0.5), 1.8, (1.0, 100.0)
 
 
+_ROWS, _COLUMNS = (8, 128), (256, 2048)
+_ELEVATION_DEG, _APART_DEG = (-35.5, 25.5), (0.02, 10.0)
+_NEAREST_M, _FARTHEST_M, _HEIGHT_M = (0.0, 3.0), (20.0, 250.0), (1.0, 3.0)
+
+
+def check_bounds(sensor: SensorModel) -> None:
+    """Refuse a sensor beyond those that networks for any sensor are trained on (:mod:`lidargrit.scans.drawn_sensors`).
+
+    Raises:
+        ConfigError: tells what lies beyond which bounds.
+    """
+    elevation_deg = sensor.elevation_rad.mean(1) * (180 / math.pi)
+    apart_deg = -elevation_deg.diff() if sensor.height > 1 else elevation_deg.new_full((1,), _APART_DEG[0])
+    height_m = sensor.setup.height_m if sensor.setup else _TYPICAL_HEIGHT_M
+    for what, low, high, bounds in (
+        ("rows", sensor.height, sensor.height, _ROWS),
+        ("columns", sensor.width, sensor.width, _COLUMNS),
+        ("degrees of elevation", float(elevation_deg.min()), float(elevation_deg.max()), _ELEVATION_DEG),
+        ("degrees between rows", float(apart_deg.min()), float(apart_deg.max()), _APART_DEG),
+        ("m of shortest range", sensor.range_min_m, sensor.range_min_m, _NEAREST_M),
+        ("m of longest range", sensor.range_max_m, sensor.range_max_m, _FARTHEST_M),
+        ("m above the road", height_m, height_m, _HEIGHT_M),
+    ):
+        if not bounds[0] <= low <= high <= bounds[1]:
+            found = f"{low:g}" if low == high else f"{low:.3g} to {high:.3g}"
+            cure = "choose columns, as --set data.columns=1024" if what == "columns" else "train a model of its own"
+            got = f"the sensor {sensor.name!r} with {found} {what}"
+            raise ConfigError(got, f"{bounds[0]:g} to {bounds[1]:g} {what}, as in training", cure)
+
+
 def with_absent_rows(sensor: SensorModel) -> SensorModel:
     """Return a sensor with as many rows below its own that the number of all is a multiple of 16."""
     absent = -sensor.height % _ROWS_AT_ONCE

@@ -104,7 +104,8 @@ class ArchiveWriter:
         """Write the file."""
         names = []
         with atomic_path(path) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
-            _add(archive, _HEADER, json.dumps(self._header, sort_keys=True).encode())
+            packed = zipfile.ZIP_DEFLATED if "rays" in self._header else zipfile.ZIP_STORED  # a long list of angles
+            _add(archive, _HEADER, json.dumps(self._header, sort_keys=True).encode(), packed)
             for name, _, _, compressed in self._written():
                 if compressed:
                     _add(archive, str(len(names)), compressed)

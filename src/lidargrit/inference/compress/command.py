@@ -19,6 +19,7 @@ from lidargrit.inference.compress.archive import Archive, writing
 from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
 
@@ -41,7 +42,9 @@ class Compressed:
         return 8 * self.num_bytes / max(self.num_returns, 1)
 
 
-def compress_scans(source: str, out: Path, model: str, step_mm: int, config: DataConfig) -> Compressed:
+def compress_scans(
+    source: str, out: Path, model: str, step_mm: int, config: DataConfig, sensor: SensorModel | None = None
+) -> Compressed:
     """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
 
     Args:
@@ -49,15 +52,16 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         config: number of scans, and what to do with unusable points and scans.
+        sensor: sensor of the scans, for a run that takes any, which the file then names; the run's own if not given.
     """
-    codec = ScanCodec(load(model), step_mm)
+    codec = _codec(model, step_mm, sensor)
     reader = ScanReader(codec.sensor, projection_variant(locate(model)), projection=config.projection)
     inputs = open_inputs(source, reader, config)
     check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
     chosen = {"source": source, "max_scans": config.max_scans}
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     told = False
-    with writing(out, _header(codec, model), chosen) as writer:
+    with writing(out, _header(codec, model, sensor), chosen) as writer:
         done = writer.go_on(inputs.identity(index) for index in range(len(inputs)))
         with reporting.progress("compressing", len(inputs), done) as progress:
             for index in range(done, len(inputs)):
@@ -123,9 +127,16 @@ def _not_kept(image: RangeImage) -> str:
     return " and no ".join(name for name, pixels in held if pixels is not None)
 
 
-def _header(codec: ScanCodec, model: str) -> dict[str, Any]:
+def _codec(model: str, step_mm: int, sensor: SensorModel | None) -> ScanCodec:
+    generator = load(model)
+    return ScanCodec(generator if sensor is None else generator.for_sensor(sensor), step_mm)
+
+
+def _header(codec: ScanCodec, model: str, given: SensorModel | None) -> dict[str, Any]:
     sensor = codec.sensor
+    rays = {} if given is None else {"rays": given.to_json()}
     return {
+        **rays,
         "model": Path(model).name,
         "model_sha256": codec.digest(),
         "step_mm": codec.steps.step_mm,
@@ -140,7 +151,8 @@ def _codec_of(archive: Archive, model: str) -> ScanCodec:
     step_mm, digest = archive.header.get("step_mm"), archive.header.get("model_sha256")
     if not (isinstance(step_mm, int) and isinstance(digest, str)):
         raise not_reproduced()
-    codec = ScanCodec(load(model), step_mm)
+    rays = archive.header.get("rays")
+    codec = _codec(model, step_mm, None if rays is None else SensorModel.from_json(rays))
     if codec.digest() != digest:
         archive_of = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
         cure = f"name that run with --model: {model} has the hash {codec.digest()[:12]}"

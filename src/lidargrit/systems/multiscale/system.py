@@ -1,6 +1,9 @@
 """A pixel decoder without tokens: seeds → range images from coarse to fine, each phase given all earlier ones."""
 
 from dataclasses import dataclass, field
+from typing import Self
+
+import torch
 
 from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
@@ -9,6 +12,7 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokens import PixelObjective
 from lidargrit.nn.random import rngs_of
@@ -43,6 +47,16 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
     def __init__(self, config: MultiscaleConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         self.pixels = PixelDecoder(config.pixels, sensor, features=0)
+
+    def for_sensor(self, sensor: SensorModel) -> Self:
+        """Return the generator for any sensor within the bounds of training, if ``config.pixels.any_sensor`` is set."""
+        if not self.config.pixels.any_sensor:
+            return super().for_sensor(sensor)
+        check_bounds(sensor)
+        with torch.device("meta"):  # its pixel decoder is replaced
+            other = type(self)(self.config, sensor)
+        other.pixels = self.pixels.for_sensor(sensor)
+        return other.train(self.training)
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> MultiscaleConfig:
