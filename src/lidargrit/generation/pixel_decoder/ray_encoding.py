@@ -55,16 +55,13 @@ def with_absent_rows(sensor: SensorModel) -> SensorModel:
     absent = -sensor.height % _ROWS_AT_ONCE
     if not absent:
         return sensor
-    below = (
-        sensor.elevation_rad[-1:]
-        - _ABSENT_APART_RAD * torch.arange(1, absent + 1, device=sensor.elevation_rad.device)[:, None]
-    )
-    azimuth = sensor.azimuth_rad
+    azimuth, setup = sensor.azimuth_rad, sensor.setup and SensorSetup(height_m=sensor.setup.height_m)
     if len(azimuth) > 1:
         azimuth = torch.cat((azimuth, azimuth[-1:].expand(absent, -1)))
-    elevation = torch.cat((sensor.elevation_rad, below))
-    setup = sensor.setup and SensorSetup(height_m=sensor.setup.height_m)
-    return replace(sensor, elevation_rad=elevation, azimuth_rad=azimuth, azimuth_offset_rad=None, setup=setup)
+    with torch.device("cpu"):  # where sensors are, also where networks are made without values
+        below = sensor.elevation_rad[-1:] - _ABSENT_APART_RAD * torch.arange(1, absent + 1)[:, None]
+        elevation = torch.cat((sensor.elevation_rad, below))
+        return replace(sensor, elevation_rad=elevation, azimuth_rad=azimuth, azimuth_offset_rad=None, setup=setup)
 
 
 def coarsest_cell_of(sensor: SensorModel, at_most: int) -> int:

@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Self
 
-import torch
-
 from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
@@ -44,19 +42,16 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
     Sampling = PixelSampling
     capabilities = frozenset({"complete", "likelihood"})
 
-    def __init__(self, config: MultiscaleConfig, sensor: SensorModel) -> None:
+    def __init__(self, config: MultiscaleConfig, sensor: SensorModel, pixels: PixelDecoder | None = None) -> None:
         super().__init__(config, sensor)
-        self.pixels = PixelDecoder(config.pixels, sensor, features=0)
+        self.pixels = pixels or PixelDecoder(config.pixels, sensor, features=0)
 
     def for_sensor(self, sensor: SensorModel) -> Self:
         """Return the generator for any sensor within the bounds of training, if ``config.pixels.any_sensor`` is set."""
         if not self.config.pixels.any_sensor:
             return super().for_sensor(sensor)
         check_bounds(sensor)
-        with torch.device("meta"):  # its pixel decoder is replaced
-            other = type(self)(self.config, sensor)
-        other.pixels = self.pixels.for_sensor(sensor)
-        return other.train(self.training)
+        return type(self)(self.config, sensor, self.pixels.for_sensor(sensor)).train(self.training)
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> MultiscaleConfig:
