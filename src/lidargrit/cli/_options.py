@@ -9,6 +9,7 @@ from lidargrit.core.untrusted import whole_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
+    from lidargrit.scans.sensors import SensorModel
 
 SCANS = ("sensor", "projection", "bad_points", "bad_scans", "set")
 """Names of the options of :func:`add_scans`."""
@@ -64,6 +65,16 @@ def sampling_words(words: Sequence[str]) -> list[str]:
             wanted = "sampling. before a setting of sampling, data. before one of reading scans"
             raise ConfigError(f"--set {word}", wanted, f"such as --set sampling.{word}")
     return [word.removeprefix("sampling.") for word in words if word.startswith("sampling.")]
+
+
+def sampled_sensor(options: argparse.Namespace) -> "SensorModel | None":
+    """Return the sensor whose scans are to be sampled, with the columns of ``--set``; None for a run's own."""
+    from lidargrit.data.prepared.config import ScanSettings
+
+    if options.sensor and options.ray:
+        raise ConfigError(f"--sensor {options.sensor} with --ray", "one of them", "leave --ray out")
+    words = [word for word in options.set if word.startswith("data.")]
+    return ScanSettings.read(words, sensor=options.sensor).load_sensor()
 
 
 def add_count(

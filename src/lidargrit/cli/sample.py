@@ -4,9 +4,17 @@ import argparse
 import os
 from pathlib import Path
 
-from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words
+from lidargrit.cli._options import (
+    add_device,
+    add_rank,
+    add_ray,
+    add_settings,
+    ray_address,
+    sampling_words,
+    sampled_sensor,
+)
 from lidargrit.cli._results import look_at
-from lidargrit.core.errors import ConfigError, counted_scans
+from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row
 
 EXAMPLES = """\
@@ -15,7 +23,6 @@ EXAMPLES = """\
   lidargrit sample runs/demo samples -n 100
   lidargrit sample runs/demo bolder -n 100 --set sampling.temperature=1.1 sampling.mask=threshold
   lidargrit sample runs/any mine --sensor mine.json       by a run of the preset multiscale_any
-  lidargrit sample runs/demo as_released -n 100 --set sampling.top_k=100
   torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
 
@@ -38,7 +45,6 @@ def run(options: argparse.Namespace) -> None:
     import torch
 
     from lidargrit.core.processes import rank_and_world_size
-    from lidargrit.data.prepared.config import ScanSettings
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
@@ -46,10 +52,7 @@ def run(options: argparse.Namespace) -> None:
 
     seeds = seeds_in_a_row(options.seed, options.count)
     address, words = ray_address(options), sampling_words(options.set)
-    reading = [word for word in options.set if word.startswith("data.")]
-    sensor = ScanSettings.read(reading, sensor=options.sensor).load_sensor()
-    if address and sensor is not None:
-        raise ConfigError(f"--sensor {options.sensor} with --ray", "one of them", "leave --ray out")
+    sensor = sampled_sensor(options)
     if address:
         write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
