@@ -67,7 +67,7 @@ def sampling_words(words: Sequence[str]) -> list[str]:
     return [word.removeprefix("sampling.") for word in words if word.startswith("sampling.")]
 
 
-def sampled_sensor(options: argparse.Namespace) -> "SensorModel | None":
+def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
     """Return the sensor whose scans are to be sampled, with the columns of ``--set``; None for a run's own."""
     from lidargrit.data.prepared.config import ScanSettings
 

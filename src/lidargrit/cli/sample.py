@@ -4,15 +4,7 @@ import argparse
 import os
 from pathlib import Path
 
-from lidargrit.cli._options import (
-    add_device,
-    add_rank,
-    add_ray,
-    add_settings,
-    ray_address,
-    sampling_words,
-    sampled_sensor,
-)
+from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words, sensor_of
 from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row
@@ -52,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
 
     seeds = seeds_in_a_row(options.seed, options.count)
     address, words = ray_address(options), sampling_words(options.set)
-    sensor = sampled_sensor(options)
+    sensor = sensor_of(options)
     if address:
         write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
