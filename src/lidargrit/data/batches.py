@@ -11,9 +11,11 @@ from torch import Tensor
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
+from lidargrit.data.pasts import Pasts
 from lidargrit.scans.augmentation import Augmentation, augment
 from lidargrit.scans.condition import NOTHING, Condition
 from lidargrit.scans.example import Example
+from lidargrit.scans.past import Past
 from lidargrit.scans.types import RangeImage
 
 _THREADS_AT_MOST = 128
@@ -35,6 +37,8 @@ class Batches:
         world_size: number of processes that train together.
         condition_of: function from a batch of images to what a generator is told of each; nothing if not given.
         with_keys: whether images come with keys, by which what is computed of them is known again.
+        past_scans: number of scans before each in its drive that a generator is told in place of ``condition_of``; 0
+            for none. Most pasts end one scan before the image, others up to ten.
     """
 
     def __init__(
@@ -49,6 +53,7 @@ class Batches:
         workers: int = 1,
         condition_of: Callable[[RangeImage], Condition] | None = None,
         with_keys: bool = False,
+        past_scans: int = 0,
     ) -> None:
         if batch_size % world_size:
             raise ConfigError(
@@ -59,6 +64,7 @@ class Batches:
         self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
         self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
         self.workers, self._condition_of, self._with_keys = workers, condition_of, with_keys
+        self._pasts = Pasts(images, past_scans) if past_scans else None
         self._epoch, self._order = -1, torch.empty(0)
         self._by_sensor = images.alike(range(len(images)), len(images))
         self._epoch_length = len(images)
@@ -98,11 +104,18 @@ class Batches:
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         stride = self.images.sensor_of(indices[0]).column_stride
         columns = [int(torch.randint(stride, (1,), generator=rng)) for rng in rngs]
-        images = self.images.batch(indices, columns if self.any_columns else None)
+        first_columns = columns if self.any_columns else None
+        images, past = self.images.batch(indices, first_columns), None
+        if self._pasts is not None:
+            gaps = [self._pasts.random_gap(index, rng) for index, rng in zip(indices, rngs, strict=True)]
+            past = self._pasts.of(indices, first_columns, gaps)
         if self.augmentations:
-            each = [augment(Example(images[i : i + 1]), self.augmentations, rng) for i, rng in enumerate(rngs)]
+            told = NOTHING if past is None else past
+            each = [augment(Example(images, told)[i : i + 1], self.augmentations, rng) for i, rng in enumerate(rngs)]
             images = RangeImage.cat([one.images for one in each])
-        example = Example(images, NOTHING if self._condition_of is None else self._condition_of(images))
+            past = past and Past.cat([one.condition for one in each if isinstance(one.condition, Past)])
+        told = NOTHING if self._condition_of is None else self._condition_of(images)
+        example = Example(images, told if past is None else past)
         return example.with_keys() if self._with_keys else example
 
     def _scan_at(self, position: int) -> int:

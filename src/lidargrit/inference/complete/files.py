@@ -110,7 +110,7 @@ def write_completions(
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
     counts = np.zeros(3, dtype=np.int64)
     with folder.writing(task.progress) as progress:
-        for batch in _batches(chain(first, jobs), model.generator.compute_batch):
+        for batch in _batches(chain(first, jobs), model.batch_size):
             for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
                 file = files[job.index * output.count + job.turn]
                 if output.probability and job.turn == 0:
@@ -206,7 +206,7 @@ def _return_share(model: Model, job: _Job, output: OutputConfig) -> Float[Tensor
     """Return how often each pixel of the model's own image returns, over samples that are not written themselves."""
     total = torch.zeros(job.condition.return_mask.shape[1:])
     remaining = iter(range(output.probability))
-    while turns := list(islice(remaining, model.generator.compute_batch)):
+    while turns := list(islice(remaining, model.batch_size)):
         condition = Observed.cat([job.condition[:1]] * len(turns))
         seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += complete_images(model, condition, seeds).return_mask.float().sum(0)
