@@ -83,7 +83,7 @@ def test_a_protocol_asks_for_what_there_is(name):
     for choice in protocol.metrics:
         assert choice.variant in load_metric(choice.metric).variants
     sensor = protocol.load_sensor()
-    assert (sensor is None) == (name in ("exact", "objects", "streets"))
+    assert (sensor is None) == (name in ("drive", "exact", "forecast", "objects", "streets"))
     if sensor is not None:
         rows = 32 if protocol.data_set == "nuscenes" else 64
         assert (sensor.height, sensor.width) == (rows, 256 if name.endswith("odometry") else 1024)

@@ -103,7 +103,7 @@ def test_json_is_all_of_standard_output_or_a_file_besides(words, capsys, tmp_pat
 
 
 def test_every_verb_that_reports_knows_json():
-    silent = {"complete", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
+    silent = {"complete", "demo", "export", "forecast", "import-weights", "publish", "raydrop", "sample", "serve"}
     silent |= {"compress", "decompress", "fine-tune", "rescan", "simulate", "upsample", "view"}
     parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
     assert parsers.keys() == {name.replace("_", "-") for name in discovery.names("cli")}

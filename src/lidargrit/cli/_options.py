@@ -68,11 +68,15 @@ def sampling_words(words: Sequence[str]) -> list[str]:
 
 
 def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
-    """Return the sensor whose scans are to be sampled, with the columns of ``--set``; None for a run's own."""
+    """Return the sensor whose scans are to be sampled, with the columns of ``--set``; None for a run's own.
+
+    A cluster samples single scans of a run's own sensor alone.
+    """
     from lidargrit.data.prepared.config import ScanSettings
 
-    if options.sensor and options.ray:
-        raise ConfigError(f"--sensor {options.sensor} with --ray", "one of them", "leave --ray out")
+    for word in ("sensor", "frames"):
+        if options.ray and getattr(options, word):
+            raise ConfigError(f"--{word} {getattr(options, word)} with --ray", "one of them", "leave --ray out")
     words = [word for word in options.set if word.startswith("data.")]
     return ScanSettings.read(words, sensor=options.sensor).load_sensor()
 

@@ -14,13 +14,14 @@ EXAMPLES = """\
   lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
   lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
   lidargrit evaluate kitti_360:/data/kitti_360:test --protocol r2dm --save-reference test.lgref    scores need no data
+  lidargrit evaluate drives --protocol forecast    each scan of a drive from the five before it
   lidargrit evaluate --tables ours.json theirs.json --table markdown
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    samples = "samples of lidargrit or of another program (.pth), or a source of scans"
+    samples = "samples (.pth of others, too), or a source of scans"
     add("samples", nargs="?", default="", help=samples)
     reference = "scans to compare with, projected with the sensor of the samples; or their .lgref"
     add("reference", nargs="?", default="", help=reference)
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
     add_device(parser)
     add_scans(parser)
-    add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
+    add("--model", default="", metavar="RUN", help="model of raydrop (streets) or of drives (forecast)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
     add(
         "--save-reference",

@@ -96,21 +96,24 @@ class PixelDecoder(nn.Module):
     Args:
         features: number of channels of the tokenizer's features; 0 for a decoder without a tokenizer.
         components: number of components of the distribution of a range that the tokenizer decodes.
+        gaps: whether what is decoded tells ranges of some pixels only, and 0 metres of the others.
 
     Source:
         Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
     """
 
-    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1) -> None:
+    def __init__(
+        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1, gaps: bool = False
+    ) -> None:
         super().__init__()
         if not config.any_sensor:
             _check_size(config, sensor)
-        self.config, self.sensor, self._sizes = config, sensor, (features, components)
+        self.config, self.sensor, self._sizes = config, sensor, (features, components, gaps)
         self._others: dict[SensorModel, PixelDecoder] = {}
         self.grid = with_absent_rows(sensor) if config.any_sensor else sensor
         self.mask = MaskNetwork(config, self.grid, features, sensor.height)
         decoded = components if config.decoded_components and features else 0
-        self.range = RangeNetwork(config, self.grid, features, decoded, sensor.height)
+        self.range = RangeNetwork(config, self.grid, features, decoded, gaps, sensor.height)
 
     def for_sensor(self, sensor: SensorModel) -> "PixelDecoder":
         """Return the decoder of another sensor's images with the very same weights: what one learns the other knows.
