@@ -10,27 +10,22 @@ from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
 if TYPE_CHECKING:
     from lidargrit.evaluation.comparison import EvalConfig
 
-_OF_TABLES = ("tables", "table")
 _OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
 _OF_REFERENCE = ("samples", "protocol", "count", "device", *SCANS)
 _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
 def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
-    """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
+    """Score by the options; simulated streets have a picture in place of a page."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.evaluation.comparison import compare_sources, read_config
     from lidargrit.evaluation.protocols import public_name
     from lidargrit.evaluation.raydrop import evaluate_streets, streets_of
     from lidargrit.evaluation.reference_file import ENDING
-    from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
 
-    if options.tables:
-        refuse_unused(options, "beside --tables", _OF_TABLES)
-        return *read_tables(options.tables, options.table), None
     if public_name(options.protocol) in ("forecast", "drive"):
         return *_of_drives(options), None
     names = ("protocol", "device", *_OF_CARDS)
@@ -45,7 +40,7 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
         raise ConfigError(f"--report with {sets[1]}, which holds no scan", "scans to show", "leave it out")
     streets = streets_of(options.samples, config) if options.reference and not sets[1].endswith(ENDING) else None
     if streets is None:
-        refuse_unused(options, "without --tables or --protocol streets", (*_OF_BOTH, *_OF_CARDS))
+        refuse_unused(options, "without --protocol streets", (*_OF_BOTH, *_OF_CARDS))
         refuse_to_overwrite(options.report, options.overwrite, ".html")
         card, pair = compare_sources(*sets, config)
         report = partial(write_report, card, pair, options.report) if options.report else None

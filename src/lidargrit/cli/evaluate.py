@@ -1,11 +1,11 @@
-"""Score samples or simulated streets against real scans, or print saved scores side by side."""
+"""Score samples or simulated streets against real scans."""
 
 import argparse
 from pathlib import Path
 
 from lidargrit.cli._evaluation import evaluated
 from lidargrit.cli._options import add_count, add_device, add_scans
-from lidargrit.cli._results import add_json, add_table, files_told, print_result, refuse_taken
+from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
@@ -15,7 +15,6 @@ EXAMPLES = """\
   lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
   lidargrit evaluate kitti_360:/data/kitti_360:test --protocol r2dm --save-reference test.lgref    scores need no data
   lidargrit evaluate drives --protocol forecast    each scan of a drive from the five before it
-  lidargrit evaluate --tables ours.json theirs.json --table markdown
 """
 
 
@@ -47,8 +46,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
     add_json(parser, "the files of --json, --report and --save-reference")
-    add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
-    add_table(parser)
 
 
 def run(options: argparse.Namespace) -> None:
