@@ -4,6 +4,7 @@ The library is large, so these tests run where it is installed, in an environmen
 first are skipped.
 """
 
+import json
 import os
 import re
 import signal
@@ -121,6 +122,43 @@ def test_a_cluster_writes_what_one_process_writes(cluster, streets, tmp_path, ca
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
     assert main([*samples[:2], str(tmp_path / "none"), "--set", "sampling.x=1", "--ray", cluster.address]) == 2
     assert "got" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_cluster_completes_and_tells_what_it_leaves_out_as_one_process_does(cluster, streets, tmp_path, capsys):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for file in sorted((streets[1] / "tree").glob("sequences/*/velodyne/*.bin"))[:4]:
+        (scans / file.name).write_bytes(file.read_bytes())
+    (scans / "000009.bin").write_bytes(b"cut")
+    words = ["--sensor", SENSOR, "--model", "nearest", "--bad-scans", "skip"]
+    told = []
+    for where in ("here", "there"):
+        out = tmp_path / "out"  # which files name
+        ray = ["--ray", cluster.address] if where == "there" else []
+        assert main(["complete", str(scans), str(out), *words, *ray]) == 0
+        told.append({line for line in capsys.readouterr().err.splitlines() if line.startswith("left out: ")})
+        out.rename(tmp_path / where)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+    assert len(told[0]) == 1
+    assert told[0] == told[1]
+
+
+def test_a_cluster_completes_compresses_and_evaluates_samples_as_one_process_does(cluster, tmp_path):
+    samples, found = tmp_path / "samples", {}
+    assert main(["sample", "pretrained", str(samples), "-n", "3"]) == 0
+    compared = [str(samples), "simulated:3:val", "--metrics", "bev_jsd", "bev_mmd", "--groups", "3"]
+    for where, ray in (("here", []), ("there", ["--ray", cluster.address])):
+        folder = tmp_path / where
+        folder.mkdir()
+        filled = ["complete", str(samples), str(folder / "filled"), "--observed", "rows:4", "--format", "image"]
+        assert main([*filled, *ray]) == 0
+        assert main(["compress", str(samples), str(folder / "scans.lgz"), *ray]) == 0
+        assert main(["evaluate", *compared, "--json", str(folder / "scores.json"), *ray]) == 0
+        scores = json.loads((folder / "scores.json").read_text())
+        found[where] = {name: {**each, "seconds": 0} for name, each in enumerate(scores.pop("scores"))}, scores
+        (folder / "scores.json").unlink()
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+    assert found["here"] == found["there"]
 
 
 @pytest.mark.parametrize("dies", ["worker", "node"])

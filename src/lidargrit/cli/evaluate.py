@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._evaluation import evaluated
-from lidargrit.cli._options import add_count, add_device, add_scans
+from lidargrit.cli._options import add_count, add_device, add_ray, add_scans
 from lidargrit.cli._results import add_json, add_table, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples")
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
     add_device(parser)
+    add_ray(parser)
     add_scans(parser)
     add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")

@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import urlsplit
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import DataError, LidarGritError, first_words
+from lidargrit.core.errors import ClusterError, DataError, LidarGritError, first_words
 from lidargrit.core.processes import process_pool
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-Share, Result = TypeVar("Share"), TypeVar("Result")
+Share = TypeVar("Share")
+Result = TypeVar("Result")
 
 _RETRIES = 3  # of a share whose worker or machine died; the same command takes up what failed more often
 _ANSWERS_WITHIN_S = 5.0
@@ -99,7 +100,9 @@ def _by_ray(do: Callable[[Share], Result], shares: Sequence[Share], address: str
         raise
     except ray.exceptions.RayError as error:
         cure = "look for what ended it, such as a lack of memory; the same command goes on"
-        raise DataError(f"a worker of the cluster that died ({first_words(error)})", "all to end well", cure) from None
+        raise ClusterError(
+            f"a worker of the cluster that died ({first_words(error)})", "all to end well", cure
+        ) from None
 
 
 class _Notes(reporting.Reporter):
