@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from lidargrit.scans.augmentation import augment
+from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 
@@ -19,7 +20,9 @@ def images_of(count, share=0.8):
 @pytest.mark.parametrize("kind", ["flip", "roll", "geometric", "geometric_reference"])
 def test_the_seed_decides_and_images_stay_valid(kind):
     images = images_of(8)
-    first, again, other = (augment(images, (kind,), torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    first, again, other = (
+        augment(Example(images), (kind,), torch.Generator().manual_seed(seed)).images for seed in (1, 1, 2)
+    )
     assert torch.equal(first.range_m, again.range_m)  # that they are valid was checked when they were made
     assert not torch.equal(first.range_m, other.range_m)
     assert torch.equal(first.return_mask, first.range_m > 0)
@@ -27,7 +30,7 @@ def test_the_seed_decides_and_images_stay_valid(kind):
 
 def test_flip_mirrors_half_of_the_images():
     images = images_of(400)
-    flipped = augment(images, ("flip",), torch.Generator().manual_seed(0)).range_m
+    flipped = augment(Example(images), ("flip",), torch.Generator().manual_seed(0)).images.range_m
     same = (flipped == images.range_m).flatten(1).all(1)
     mirrored = (flipped == images.range_m.flip(-1)).flatten(1).all(1)
     assert bool((same | mirrored).all())
@@ -36,17 +39,17 @@ def test_flip_mirrors_half_of_the_images():
 
 def test_roll_turns_each_image_by_whole_columns():
     images = images_of(6)
-    rolled = augment(images, ("roll",), torch.Generator().manual_seed(0)).range_m
+    rolled = augment(Example(images), ("roll",), torch.Generator().manual_seed(0)).images.range_m
     for before, after in zip(images.range_m, rolled, strict=True):
         assert any(torch.equal(before.roll(-shift, -1), after) for shift in range(SENSOR.width))
 
 
 def test_geometric_fills_with_no_return_and_the_programs_with_a_far_wall():
     full = RangeImage(torch.full((64, 64, 256), 9.0), torch.ones(64, 64, 256, dtype=torch.bool), SENSOR)
-    ours = augment(full, ("geometric",), torch.Generator().manual_seed(0))
+    ours = augment(Example(full), ("geometric",), torch.Generator().manual_seed(0)).images
     assert set(ours.range_m.unique().tolist()) == {0.0, 9.0}
     assert 0.02 < float((~ours.return_mask).float().mean()) < 0.4
-    program = augment(full, ("geometric_reference",), torch.Generator().manual_seed(0))
+    program = augment(Example(full), ("geometric_reference",), torch.Generator().manual_seed(0)).images
     assert set(program.range_m.unique().tolist()) == {9.0, SENSOR.range_max_m}
     assert bool(program.return_mask.all())
     untouched = (ours.range_m == 9).flatten(1).all(1)
@@ -58,7 +61,7 @@ def test_a_rotation_keeps_shapes_in_pixels():
     square = torch.zeros(200, 64, 256)
     square[:, 24:40, 120:136] = 7.0
     images = RangeImage(square, square > 0, SENSOR)
-    turned = augment(images, ("geometric",), torch.Generator().manual_seed(0)).return_mask
+    turned = augment(Example(images), ("geometric",), torch.Generator().manual_seed(0)).images.return_mask
     area = turned.sum((1, 2)) / 256
     assert float(area.min()) > 0.7
     assert float(area.max()) < 1.3

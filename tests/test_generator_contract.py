@@ -83,9 +83,9 @@ def scans_of(generator, seeds, sampling):
 
 @functools.cache
 def sampled_together(name):
-    """Return the scans of seeds 3 to 13, which are more than a batch that is computed at once."""
+    """Return the scans of seeds 3 to 11, which are more than a batch that is computed at once."""
     generator, sampling = made(name)
-    return scans_of(generator, range(3, 14), sampling)
+    return scans_of(generator, range(3, 12), sampling)
 
 
 def same(one: RangeImage, other: RangeImage) -> bool:
@@ -131,10 +131,10 @@ pytestmark = pytest.mark.parametrize("name", NAMES)
 
 def test_a_seed_gives_the_same_scan_bit_for_bit_whatever_the_batch(name):
     generator, sampling = made(name)
-    seeds, together = list(range(3, 14)), sampled_together(name)
+    seeds, together = list(range(3, 12)), sampled_together(name)
     for index in (0, 7):  # first and last of the first batch; below, each scan has another place in another batch
         assert same(scans_of(generator, [seeds[index]], sampling), together[index : index + 1]), seeds[index]
-    assert same(scans_of(generator, seeds[::-1], sampling), RangeImage.stack([together[i] for i in range(10, -1, -1)]))
+    assert same(scans_of(generator, seeds[::-1], sampling), RangeImage.stack([together[i] for i in range(8, -1, -1)]))
     assert torch.equal(together.range_m[0], together.range_m[1]) != generator.is_random
 
 
@@ -152,7 +152,7 @@ def test_streams_the_same_scans_without_end(name):
     generator, sampling = made(name)
     if Nothing not in generator.takes:
         return
-    streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling), 11))
+    streamed = list(itertools.islice(generator.stream(itertools.count(3), sampling), 9))
     assert same(RangeImage.stack(streamed), sampled_together(name))
 
 
@@ -246,14 +246,13 @@ def test_saved_and_loaded_it_samples_the_same(name, tmp_path):
     generator.save(tmp_path)
     again = load(tmp_path)
     assert again.config == generator.config
-    assert same(scans_of(again, [7], sampling), scans_of(generator, [7], sampling))
+    assert same(scans_of(again, [7], sampling), sampled_together(name)[4:5])
 
 
 def test_leaves_the_global_random_state_alone(name):
     generator, sampling = made(name)
     before = torch.get_rng_state()
     scans_of(generator, [0], sampling)
-    generator.cost(sampling)
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -375,6 +374,8 @@ def test_tells_what_it_generates_and_where_it_comes_from(name):
 
 def test_tells_what_a_scan_costs(name):
     generator, sampling = made(name)
+    before = torch.get_rng_state()
     cost = generator.cost(sampling)
+    assert torch.equal(torch.get_rng_state(), before)
     assert (cost.network_evaluations > 0) == (cost.flops > 0) == bool(generator.stages)
     assert cost == generator.cost(sampling)

@@ -8,7 +8,7 @@ import pytest
 from lidargrit.core.errors import ConfigError
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
-from lidargrit.simulator.mesh import Finish, Mesh
+from lidargrit.simulator.mesh import Finish
 from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.body_types import BODY_TYPES
 from lidargrit.simulator.scene.layout import driving, parked
@@ -19,7 +19,7 @@ from lidargrit.simulator.scene.vehicles import make_vehicles, vehicle_shape
 from lidargrit.simulator.tracing import objects_in_reach
 
 THEMES = ("city", "suburb", "country")
-SEEDS = range(12)
+SEEDS = range(8)
 CARS = (classes.CAR, classes.MOVING_CAR, classes.TRUCK, classes.MOVING_TRUCK)
 FIELDS = ("triangles_m", "material", "albedo", "label", "instance")
 
@@ -46,8 +46,9 @@ def test_one_state_one_scene(theme):
     np.random.seed(2)  # noqa: NPY002
     two = sample_scene(np.random.default_rng(7), theme)
     for time_s in (0.0, 0.7):
+        first, second = one.mesh(time_s), two.mesh(time_s)
         for field in FIELDS:
-            assert np.array_equal(getattr(one.mesh(time_s), field), getattr(two.mesh(time_s), field)), field
+            assert np.array_equal(getattr(first, field), getattr(second, field)), field
         assert np.array_equal(one.sensor_pose(time_s), two.sensor_pose(time_s))
     assert len(sample_scene(np.random.default_rng(8), theme).mesh()) != len(one.mesh())
 
@@ -102,12 +103,12 @@ def test_nothing_stands_in_our_own_car(scenes, time_s):
     for key, scene in scenes.items():
         pose = scene.sensor_pose(time_s)
         near_us = objects_in_reach(scene.objects(time_s), [pose], range_max_m=5.0)
-        mesh = Mesh.join([scene.standing, near_us.mesh()])
         to_sensor = np.linalg.inv(pose)
-        local = mesh.triangles_m @ to_sensor[:3, :3].T + to_sensor[:3, 3]
-        apart = (local.max(axis=1) < low) | (local.min(axis=1) > high)  # by their own boxes: stricter than need be
-        near = ~apart.any(axis=1)
-        assert not near.any(), (key, np.unique(mesh.label[near]))
+        for mesh in (scene.standing, near_us.mesh()):
+            local = mesh.triangles_m @ to_sensor[:3, :3].T.astype(np.float32) + to_sensor[:3, 3].astype(np.float32)
+            apart = (local.max(axis=1) < low) | (local.min(axis=1) > high)  # by their own boxes: stricter than need be
+            near = ~apart.any(axis=1)
+            assert not near.any(), (key, np.unique(mesh.label[near]))
 
 
 def test_the_sensor_stands_over_the_road(scenes):
@@ -166,7 +167,7 @@ def test_houses_have_windows(meshes):
         glass = facade & (mesh.material == materials.GLASS)
         if area[facade].sum() > 200:  # some streets are open to both sides
             shares.append(area[glass].sum() / area[facade].sum())
-    assert len(shares) > 15
+    assert len(shares) > 10
     assert 0.03 < np.mean(shares) < 0.3
     assert np.percentile(shares, 10) > 0.01
 
@@ -268,13 +269,15 @@ def test_what_moves_moves_and_the_rest_stays(scenes):
         assert (way[~moving] == 0).all()
         assert (way[moving] > 0.3).all()
         moved += len(np.unique(one.instance[moving]))
-    assert moved > 30
+    assert moved > 20
 
 
 def test_backdrop_leaves_little_bare_sky(scenes):
     """In most directions something stands higher than the sensor's top ring."""
     share = {theme: [] for theme in THEMES}
-    for (theme, _), scene in scenes.items():
+    for (theme, seed), scene in scenes.items():
+        if seed > 3:
+            continue
         corner = scene.mesh().triangles_m.reshape(-1, 3)
         flat = np.hypot(corner[:, 0], corner[:, 1])
         high = corner[(corner[:, 2] - SENSOR_HEIGHT_M) > np.tan(np.radians(2.6)) * flat]

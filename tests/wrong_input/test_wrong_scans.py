@@ -52,31 +52,37 @@ def test_a_damaged_scan(refused, rows, tmp_path, verb, damage):
     assert re.search(DAMAGE[damage].replace("BAD", re.escape("scans/000001.bin")), refused(*words))
 
 
-@pytest.mark.parametrize("damage", ["infinite", "origin"])
-def test_bad_points_are_dropped_by_the_setting_that_the_message_names(refused, rows, tmp_path, damage):
+def test_bad_points_are_dropped_by_the_setting_that_the_message_names(refused, rows, tmp_path):
     (tmp_path / "scans").mkdir()
-    (tmp_path / "scans" / "000001.bin").write_bytes(changed(rows, damage))
     words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]", f"data.val=[{tmp_path / 'scans'}]"]
-    setting = re.findall(r"--bad-points|(?<=--bad-points )\w+", refused(*words))
-    assert len(setting) == 2
+    for damage, name in (("infinite", "000001.bin"), ("origin", "000000.bin")):  # the first bad scan is told
+        (tmp_path / "scans" / name).write_bytes(changed(rows, damage))
+        message = refused(*words)
+        assert name in message
+        setting = re.findall(r"--bad-points|(?<=--bad-points )\w+", message)
+        assert len(setting) == 2
     assert main([*words, *setting]) == 0, "the same folder can be used: nothing had begun"
     assert (tmp_path / "run" / "model.safetensors").exists()
 
 
-@pytest.mark.parametrize("damage", ["cut short", "NaN", "reflectance"])
-def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, rows, tmp_path, capsys, damage):
+def test_bad_scans_are_left_out_by_the_setting_that_the_message_names(refused, rows, tmp_path, capsys):
     (tmp_path / "scans").mkdir()
-    for index, name in enumerate(("not at all", damage, "not at all")):
-        (tmp_path / "scans" / f"{index:06d}.bin").write_bytes(changed(rows, name))
     words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]"]
-    setting = re.findall(r"--bad-scans|(?<=--bad-scans )\w+", refused(*words))
-    assert len(setting) == 2
+    bad = {"000003.bin": "cut short", "000002.bin": "NaN", "000001.bin": "reflectance"}  # the first bad scan is told
+    for name in ("000000.bin", "000004.bin"):
+        (tmp_path / "scans" / name).write_bytes(changed(rows, "not at all"))
+    for name, damage in bad.items():
+        (tmp_path / "scans" / name).write_bytes(changed(rows, damage))
+        message = refused(*words)
+        assert name in message
+        setting = re.findall(r"--bad-scans|(?<=--bad-scans )\w+", message)
+        assert len(setting) == 2
     assert main([*words, *setting]) == 0
     output = capsys.readouterr().err
-    assert output.count("left out: got ") == 1
-    assert "000001.bin" in output
+    assert output.count("left out: got ") == len(bad)
+    assert all(name in output for name in bad)
     (tmp_path / "scans" / "000000.bin").unlink()
-    (tmp_path / "scans" / "000002.bin").unlink()
+    (tmp_path / "scans" / "000004.bin").unlink()
     assert "no usable scan in" in refused(*train_words(tmp_path / "none"), *words[-1:], *setting)
 
 
@@ -88,16 +94,21 @@ REAL_DAMAGE = {
 
 
 @pytest.mark.shared
-@pytest.mark.parametrize("name", REAL_DAMAGE)
-def test_a_real_damaged_scan(refused, real, rows, tmp_path, capsys, name):
+def test_real_damaged_scans(refused, real, rows, tmp_path, capsys):
     (tmp_path / "scans").mkdir()
-    shutil.copy(real / "damaged" / f"{name}.bin", tmp_path / "scans")
-    assert re.search(REAL_DAMAGE[name], refused("view", tmp_path / "scans", "-o", tmp_path / "picture.png"))
     words = [*train_words(tmp_path / "run"), f"data.train=[{tmp_path / 'scans'}]"]
-    assert re.search(REAL_DAMAGE[name], refused(*words))
+    for name, said in REAL_DAMAGE.items():
+        scan = tmp_path / "scans" / f"{name}.bin"
+        shutil.copy(real / "damaged" / scan.name, scan)
+        assert re.search(said, refused("view", tmp_path / "scans", "-o", tmp_path / "picture.png"))
+        assert re.search(said, refused(*words))
+        scan.rename(tmp_path / scan.name)
+    for name in REAL_DAMAGE:
+        (tmp_path / f"{name}.bin").rename(tmp_path / "scans" / f"{name}.bin")
     (tmp_path / "scans" / "good.bin").write_bytes(rows.tobytes())
     assert main([*words, "data.bad_scans=skip"]) == 0
-    assert re.search(f"left out: {REAL_DAMAGE[name]}", capsys.readouterr().err)
+    told = capsys.readouterr().err
+    assert all(re.search(f"left out: {said}", told) for said in REAL_DAMAGE.values())
 
 
 def test_a_folder_with_no_scan_in_it(refused, tmp_path):

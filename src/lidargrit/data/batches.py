@@ -87,8 +87,8 @@ class Batches:
         columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
         images = self.images.batch(indices, columns if self.any_columns else None)
         if self.augmentations:
-            each = [augment(images[i : i + 1], self.augmentations, rng)[0] for i, rng in enumerate(rngs)]
-            images = RangeImage.stack(each)
+            each = [augment(Example(images[i : i + 1]), self.augmentations, rng) for i, rng in enumerate(rngs)]
+            images = RangeImage.cat([one.images for one in each])
         example = Example(images, NOTHING if self._condition_of is None else self._condition_of(images))
         return example.with_keys() if self._with_keys else example
 

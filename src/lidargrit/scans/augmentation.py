@@ -1,4 +1,4 @@
-"""Range images → randomly changed ones for training; range, return mask, reflectance and label change together."""
+"""Training examples → randomly changed ones: all planes of an image change together, and the past turns with it."""
 
 import math
 from collections.abc import Sequence
@@ -10,6 +10,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.core.errors import ConfigError
+from lidargrit.scans.example import Example
+from lidargrit.scans.past import Past
 from lidargrit.scans.types import RangeImage
 
 Augmentation = Literal["flip", "roll", "geometric", "geometric_reference"]
@@ -20,8 +23,8 @@ _MAX_SCALE_CHANGE = 0.1  # ... and scales from 0.9 to 1.1
 _EXTRA_ROTATION_RAD = math.radians(45)  # the program rotates by up to 45 degrees before that
 
 
-def augment(images: RangeImage, kinds: Sequence[Augmentation], rng: torch.Generator) -> RangeImage:
-    """Change every image of a batch at random.
+def augment(example: Example, kinds: Sequence[Augmentation], rng: torch.Generator) -> Example:
+    """Change every example of a batch at random.
 
     Args:
         kinds: kinds of change, made one after the other. ``flip`` mirrors left and right with probability 1/2. ``roll``
@@ -30,31 +33,46 @@ def augment(images: RangeImage, kinds: Sequence[Augmentation], rng: torch.Genera
             are *no return*. ``geometric_reference`` is the same with the larger rotation of the authors' program, which
             fills such pixels with returns at the longest range.
 
+    Raises:
+        ConfigError: a geometric change of a scan with a past, whose rays would no longer be those of its sensor.
+
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2.2 (the paper gives no numbers); numbers from the program,
         hamedhaghighi/LidarGRIT@a3f86e7.
     """
     for kind in kinds:
-        images = {"flip": _flip, "roll": _roll, "geometric": _geometric, "geometric_reference": _geometric_reference}[
-            kind
-        ](images, rng)
-    return images
+        if kind == "flip":
+            example = _flip(example, rng)
+        elif kind == "roll":
+            example = _roll(example, rng)
+        elif isinstance(example.condition, Past):
+            raise ConfigError(f"the augmentation {kind} of scans with a past", "flip or roll", "leave it out")
+        else:
+            change = _geometric if kind == "geometric" else _geometric_reference
+            example = replace(example, images=change(example.images, rng))
+    return example
 
 
 def _coin(images: RangeImage, rng: torch.Generator) -> Tensor:
     return (torch.rand(len(images), generator=rng) < 0.5).to(images.range_m.device)[:, None, None]
 
 
-def _flip(images: RangeImage, rng: torch.Generator) -> RangeImage:
+def _flip(example: Example, rng: torch.Generator) -> Example:
+    images, condition = example.images, example.condition
     flipped = _coin(images, rng)
-    return _pick(flipped, images.mapped(lambda pixels: pixels.flip(-1)), images)
+    if isinstance(condition, Past):
+        condition = condition.mirrored(flipped[:, 0, 0])
+    return Example(_pick(flipped, images.mapped(lambda pixels: pixels.flip(-1)), images), condition)
 
 
-def _roll(images: RangeImage, rng: torch.Generator) -> RangeImage:
+def _roll(example: Example, rng: torch.Generator) -> Example:
+    images, condition = example.images, example.condition
     width = images.range_m.shape[-1]
     shift = torch.randint(width, (len(images), 1, 1), generator=rng).to(images.range_m.device)
     column = ((torch.arange(width, device=shift.device) + shift) % width).expand_as(images.range_m)
-    return images.mapped(lambda pixels: pixels.gather(-1, column))
+    if isinstance(condition, Past):
+        condition = condition.turned(shift[:, 0, 0] * images.sensor.column_stride)
+    return Example(images.mapped(lambda pixels: pixels.gather(-1, column)), condition)
 
 
 def _geometric(images: RangeImage, rng: torch.Generator) -> RangeImage:
