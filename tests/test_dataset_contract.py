@@ -14,7 +14,7 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
 
 NAMES = discovery.names("datasets")
-READ_ONLY = {"ouster", "pandaset"}
+READ_ONLY = {"ncore", "ouster", "pandaset", "py123d"}
 ROOT = Path("4")  # a folder for those that read files, a count for the simulated one
 
 

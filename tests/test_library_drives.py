@@ -15,6 +15,7 @@ from lidargrit.core.errors import DataError
 from lidargrit.data.datasets import open_dataset, recognise
 
 ROWS, COLUMNS, TURN_US = 8, 12, 100_000
+TURNED, PLACE_M = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 0.0, 1.8])  # of a LiDAR on a vehicle
 
 
 def turns() -> list[dict[str, np.ndarray]]:
@@ -91,10 +92,63 @@ def test_a_drive_of_ncore_is_read_as_its_library_wrote_it(tmp_path, capsys):
     assert "which nvidia-ncore cannot read" in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(("name", "file", "library"), [("ncore", "toy.ncore4.zarr.itar", "nvidia-ncore")])
+def write_123d(folder: Path, holds_points: bool = True) -> None:
+    writers = pytest.importorskip("py123d.api.scene.arrow.arrow_log_writer")
+    from py123d.api.scene.arrow.utils.log_writer_config import LogWriterConfig  # pyright: ignore[reportMissingImports]
+    from py123d.datatypes.metadata.log_metadata import LogMetadata  # pyright: ignore[reportMissingImports]
+    from py123d.datatypes.sensors import lidar  # pyright: ignore[reportMissingImports]
+    from py123d.datatypes.time.timestamp import Timestamp  # pyright: ignore[reportMissingImports]
+    from py123d.geometry import PoseSE3  # pyright: ignore[reportMissingImports]
+    from py123d.parser.base_dataset_parser import ModalitiesSync, ParsedLidar  # pyright: ignore[reportMissingImports]
+
+    stored = {"lidar_store_option": "binary", "lidar_codec": "ipc_zstd"} if holds_points else {}
+    writer = writers.ArrowLogWriter(LogWriterConfig(**stored), folder, folder / "sensors")
+    assert writer.reset(LogMetadata("toy", "toy_train", "log_1", None))
+    place = PoseSE3.from_R_t(TURNED, PLACE_M)
+    about = lidar.LidarMetadata("top", lidar.LidarID.LIDAR_TOP, place)
+    merged = lidar.LidarMergedMetadata({lidar.LidarID.LIDAR_TOP: about})
+    for number, turn in enumerate(turns()):
+        hit = ~np.isnan(turn["range_m"])
+        xyz_m = (turn["direction"] * turn["range_m"][:, None])[hit] @ TURNED.T + PLACE_M
+        features = {"ids": np.full(len(xyz_m), 2, np.uint8), "channel": turn["row"][hit].astype(np.uint8)}
+        features |= {"intensity": np.rint(turn["intensity"][hit] * 255).astype(np.uint8)}
+        features |= {"timestamps": turn["time_us"][hit].astype(np.int64)}
+        begun, ended = (Timestamp.from_us((number + at) * TURN_US) for at in (0, 1))
+        seen = lidar.Lidar(begun, ended, merged, xyz_m.astype(np.float32), features)
+        named = ParsedLidar(merged, begun, ended, folder, f"{number}.pkl.gz")
+        writer.write_sync(ModalitiesSync(begun, [seen if holds_points else named]))
+    writer.close()
+
+
+def test_a_log_of_py123d_is_read_as_its_library_wrote_it(tmp_path):
+    write_123d(tmp_path / "logs")
+    assert recognise(tmp_path / "logs") == "py123d"
+    dataset = open_dataset(f"py123d:{tmp_path / 'logs'}")
+    assert [dataset.name(index) for index in range(len(dataset))] == ["toy_train/log_1#0", "toy_train/log_1#1"]
+    for index, turn in enumerate(turns()):
+        scan, hit = dataset.scan(index), ~np.isnan(turn["range_m"])
+        wanted = (turn["direction"] * turn["range_m"][:, None])[hit]
+        np.testing.assert_allclose(scan.points_xyz_m.numpy(), wanted, atol=1e-5)
+        assert scan.ring is not None
+        assert scan.reflectance is not None
+        assert scan.point_time_s is not None
+        assert scan.ring.tolist() == turn["row"][hit].tolist()
+        np.testing.assert_allclose(scan.reflectance.numpy(), turn["intensity"][hit], atol=0.5 / 255 + 1e-6)
+        np.testing.assert_allclose(scan.point_time_s.numpy() * 1e6, turn["time_us"][hit] - index * TURN_US, atol=1e-6)
+        assert dataset.motion(index) == (pytest.approx(0.1 * index), None)
+    write_123d(tmp_path / "paths", holds_points=False)
+    with pytest.raises(DataError, match=r"names files in place of points.*lidar_store_option: binary"):
+        open_dataset(f"py123d:{tmp_path / 'paths'}")
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "library"),
+    [("ncore", "toy.ncore4.zarr.itar", "nvidia-ncore"), ("py123d", "toy_train/log_1/sync.arrow", "py123d")],
+)
 def test_a_library_that_is_missing_is_asked_for(tmp_path, monkeypatch, name, file, library):
-    for module in ("ncore", "ncore.data.v4"):
+    for module in ("ncore", "ncore.data.v4", "py123d", "py123d.api.scene.arrow.arrow_scene_builder"):
         monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).write_bytes(b"PK")
-    with pytest.raises(DataError, match=f"takes {library} to read.*pip install {library}"):
+    with pytest.raises(DataError, match=rf"takes {library} to read.*lidargrit\[{name}\]"):
         open_dataset(f"{name}:{tmp_path}")

@@ -157,7 +157,7 @@ def test_a_cluster_scores_as_one_process_does(cluster, tmp_path):
 
 def test_a_cluster_completes_and_compresses_samples_as_one_process_does(cluster, tmp_path):
     samples, out = tmp_path / "samples", tmp_path / "out"
-    assert main(["sample", "pretrained", str(samples), "-n", "3"]) == 0
+    assert main(["sample", "pretrained", str(samples), "-n", "2"]) == 0
     for where, ray in (("here", []), ("there", ["--ray", cluster.address])):
         out.mkdir()
         filled = ["complete", str(samples), str(out / "filled"), "--observed", "rows:4", "--format", "image"]

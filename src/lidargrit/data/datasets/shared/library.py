@@ -47,7 +47,7 @@ class LibraryDataset(FileDataset):
         try:
             return _opened_once(cls, path, path.stat().st_mtime_ns)
         except ImportError:
-            cure = f"pip install {cls.library}, in an environment of its own"
+            cure = f"pip install 'lidargrit[{cls.public_name()}]', in an environment of its own"
             raise DataError(f"{path}, which takes {cls.library} to read", "it installed", cure) from None
         except DataError:
             raise
