@@ -5,7 +5,7 @@ import torch
 
 from lidargrit.core.errors import CheckpointError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
-from lidargrit.generation.facts import NoSampling
+from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.generator import load
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.marginal.system import Marginal, MarginalConfig
@@ -79,7 +79,7 @@ def test_they_are_saved_and_loaded_and_obey_seeds(make, store, tmp_path):
     generator.fit_statistics(RangeImages(SENSOR, [store]))
     generator.save(tmp_path)
     again = load(tmp_path)
-    alone, together = again.sample([7], sampling=NoSampling()), generator.sample([5, 7])
+    alone, together = again.sample([7], sampling=SamplingSettings()), generator.sample([5, 7])
     assert torch.equal(alone.range_m[0], together.range_m[1])
     assert torch.equal(alone.return_mask, alone.range_m > 0)
     assert not generator.stages

@@ -1,5 +1,6 @@
 """The contract that every generator keeps: seeds, limits, saving, what it declares, what it costs."""
 
+import dataclasses
 import functools
 import itertools
 import re
@@ -136,6 +137,19 @@ def test_a_seed_gives_the_same_scan_bit_for_bit_whatever_the_batch(name):
         assert same(scans_of(generator, [seeds[index]], sampling), together[index : index + 1]), seeds[index]
     assert same(scans_of(generator, seeds[::-1], sampling), RangeImage.stack([together[i] for i in range(8, -1, -1)]))
     assert torch.equal(together.range_m[0], together.range_m[1]) != generator.is_random
+
+
+def test_batches_of_another_size_change_last_digits_alone(name):
+    generator, sampling = made(name)
+    if not generator.takes:
+        return  # it labels scans one by one
+    threes = dataclasses.replace(sampling, batch_size=3)
+    assert generator.batch_size(threes) == 3
+    assert generator.batch_size(sampling) == generator.own_batches[0]
+    found, usual = scans_of(generator, range(3, 8), threes), sampled_together(name)[:5]
+    assert (found.return_mask == usual.return_mask).float().mean() > 0.999
+    both = found.return_mask & usual.return_mask
+    assert ((found.range_m - usual.range_m)[both].abs() < 1e-3).float().mean() > 0.999
 
 
 def test_threads_and_inference_mode_change_no_scan(name):

@@ -217,8 +217,8 @@ def test_the_cost_is_what_torch_counts(guidance, layers):
     preset = load_preset("lidargrit_small", [*changes, "data.columns=512", "data.column_stride=16"])
     generator = LidarGrit(preset.model, preset.data.load_sensor())
     with FlopCounterMode(display=False) as counter:
-        generator.sample(range(generator.compute_batch))
-    assert generator.cost().flops * generator.compute_batch == counter.get_total_flops()
+        generator.sample(range(generator.batch_size()))
+    assert generator.cost().flops * generator.batch_size() == counter.get_total_flops()
     assert generator.cost().network_evaluations == 128 + 1
 
 

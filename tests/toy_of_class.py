@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.conditions import ToldOfScans
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.random import rngs_of
@@ -48,7 +48,7 @@ class ToyConfig:
     start: float = 2.0
 
 
-class Toy(Generator[ToyConfig, NoSampling]):
+class Toy(Generator[ToyConfig, SamplingSettings]):
     """A mean for each class, and one for scans of which nothing is known."""
 
     Config = ToyConfig

@@ -9,9 +9,11 @@ import torch
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
+from lidargrit.data.pasts import Pasts
 from lidargrit.scans.augmentation import Augmentation, augment
 from lidargrit.scans.condition import NOTHING, Condition
 from lidargrit.scans.example import Example
+from lidargrit.scans.past import Past
 from lidargrit.scans.types import RangeImage
 
 _THREADS_AT_MOST = 128
@@ -30,6 +32,8 @@ class Batches:
         world_size: number of processes that train together.
         condition_of: function from a batch of images to what a generator is told of each; nothing if not given.
         with_keys: whether images come with keys, by which what is computed of them is known again.
+        past_scans: number of scans before each in its drive that a generator is told in place of ``condition_of``; 0
+            for none. Most pasts end one scan before the image, others up to ten.
     """
 
     def __init__(
@@ -44,6 +48,7 @@ class Batches:
         workers: int = 1,
         condition_of: Callable[[RangeImage], Condition] | None = None,
         with_keys: bool = False,
+        past_scans: int = 0,
     ) -> None:
         if batch_size % world_size:
             raise ConfigError(
@@ -54,6 +59,7 @@ class Batches:
         self.images, self.batch_size, self.augmentations = images, batch_size, tuple(augmentations)
         self.any_columns, self.seed, self.rank, self.world_size = any_columns, seed, rank, world_size
         self.workers, self._condition_of, self._with_keys = workers, condition_of, with_keys
+        self._pasts = Pasts(images, past_scans) if past_scans else None
         self._epoch, self._order = -1, torch.empty(0)
 
     def stream(self, scans_seen: int, until: int) -> Iterator[Example]:
@@ -85,11 +91,18 @@ class Batches:
         # Each scan has its own random numbers, so that it looks the same however many processes share a batch.
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
         columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
-        images = self.images.batch(indices, columns if self.any_columns else None)
+        first_columns = columns if self.any_columns else None
+        images, past = self.images.batch(indices, first_columns), None
+        if self._pasts is not None:
+            gaps = [self._pasts.random_gap(index, rng) for index, rng in zip(indices, rngs, strict=True)]
+            past = self._pasts.of(indices, first_columns, gaps)
         if self.augmentations:
-            each = [augment(Example(images[i : i + 1]), self.augmentations, rng) for i, rng in enumerate(rngs)]
+            told = NOTHING if past is None else past
+            each = [augment(Example(images, told)[i : i + 1], self.augmentations, rng) for i, rng in enumerate(rngs)]
             images = RangeImage.cat([one.images for one in each])
-        example = Example(images, NOTHING if self._condition_of is None else self._condition_of(images))
+            past = past and Past.cat([one.condition for one in each if isinstance(one.condition, Past)])
+        told = NOTHING if self._condition_of is None else self._condition_of(images)
+        example = Example(images, told if past is None else past)
         return example.with_keys() if self._with_keys else example
 
     def _scan_at(self, position: int) -> int:

@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Float32, Shaped
 
 from lidargrit.core.errors import DataError, LidarGritError
+from lidargrit.data.windows import TimedScan
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.planes import PLANES
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -90,6 +92,13 @@ class ImageStore(Protocol):
         ...
 
 
+@runtime_checkable
+class TimedStore(Protocol):
+    """A source of pixels of images whose times and poses are known, or some of them."""
+
+    motions: Sequence[Motion]
+
+
 class RangeImages:
     """Range images of one sensor, in one or more stores, numbered through.
 
@@ -114,6 +123,25 @@ class RangeImages:
     def provenance(self) -> Provenance:
         """Provenance of all images, in their order."""
         return Provenance.joined([store.provenance for store in self._stores])
+
+    def timed_scans(self) -> list[TimedScan]:
+        """Return when and where each image was made, as far as its store knows."""
+        found = list[TimedScan]()
+        for part, store in enumerate(self._stores):
+            names = store.provenance.names or tuple(f"image {number}" for number in range(len(store)))
+            recordings = store.provenance.recordings or ("",) * len(store)
+            motions = store.motions if isinstance(store, TimedStore) else (Motion(),) * len(store)
+            each = zip(names, recordings, motions, strict=True)
+            found += [TimedScan(name, f"{part} {drive}", motion) for name, drive, motion in each]
+        return found
+
+    def with_fine_columns(self) -> "RangeImages":
+        """Return the images with all fine columns of the sensor.
+
+        Raises:
+            DataError: when one is read that lacks them, as images that were not projected here do.
+        """
+        return RangeImages(self.sensor.fine(), self._stores)
 
     @cached_property
     def _planes(self) -> frozenset[str]:
@@ -145,6 +173,9 @@ class RangeImages:
             names = store.provenance.names
             got = f"{names[number] if names else f'image {number}'} without {' and '.join(sorted(lacking))}"
             raise DataError(got, "what the first image beside it has", "remove it, or make all of them alike")
+        if whole.range_m.shape[1] < self.sensor.width:
+            got = f"images of {whole.range_m.shape[1]} columns"
+            raise DataError(got, f"all {self.sensor.width} fine columns", "name the scans that they were made of")
         kept = slice(first_column, None, whole.range_m.shape[1] // self.sensor.width)
         return Pixels(whole.range_m[:, kept], {name: whole.planes[name][:, kept] for name in self._planes})
 

@@ -32,6 +32,7 @@ from lidargrit.evaluation.protocols import MetricChoice, load_protocol, public_n
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
 from lidargrit.evaluation.tables import share_pixel_statistics, side_by_side
 from lidargrit.evaluation.verdict import MEMORISED, PIXEL_STATISTICS
+from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.generation.presets import is_preset, load_preset
 from lidargrit.generation.settings import Preset
@@ -310,7 +311,7 @@ class _Plan:
     system: str
     run: Path
     preset: Preset | None
-    sampling: object
+    sampling: SamplingSettings | None
     sensor: SensorModel | None
     samples: Source | None = None
     card: Scorecard | None = None
@@ -338,7 +339,7 @@ class _Plan:
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: object, benchmark: Benchmark
+    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings | None, benchmark: Benchmark
 ) -> tuple[int, float] | None:
     """Sample what is not there yet, and return how many scans and the seconds for each; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0

@@ -196,9 +196,9 @@ def _score(
 
 
 def _complete(model: Model, condition: Observed, turn: int, seed: int) -> RangeImage:
-    parts = []
-    for first in range(0, len(condition), model.generator.compute_batch):
-        some = condition[first : first + model.generator.compute_batch]
+    parts, size = [], model.batch_size
+    for first in range(0, len(condition), size):
+        some = condition[first : first + size]
         seeds = [scan_seed(seed + turn, index) for index in range(first, first + len(some))]
         parts.append(model.complete(some, seeds))
     return RangeImage.cat(parts)

@@ -77,8 +77,9 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
     """
     _check(generator)
     dropped = []
-    for first in range(0, len(clean), generator.compute_batch):
-        some = clean[first : first + generator.compute_batch]
+    size = generator.batch_size()
+    for first in range(0, len(clean), size):
+        some = clean[first : first + size]
         seeds = range(first, first + len(some))
         dropped.append(generator.complete(Observed.of_surfaces(some), seeds).to("cpu"))
     return score_curves(RangeImage.cat(dropped), clean, true, RAYDROP_CURVES, scans)

@@ -1,9 +1,13 @@
 """Facts about a generative system: what it generates and where it comes from → lines for a person."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 from lidargrit.core.configuration import Settings
+from lidargrit.core.typed_values import Bounds
+
+_BATCH_AT_MOST = 4096  # scans: tens of GB of activations of the smallest networks
 
 CAPABILITIES = {  # name → what a generator with it can do besides sampling, for messages
     "tokens": "turn scans into tokens and back",
@@ -15,8 +19,16 @@ CAPABILITIES = {  # name → what a generator with it can do besides sampling, f
 
 
 @dataclass(frozen=True)
-class NoSampling(Settings):
-    """Settings of a generator that leaves nothing to choose."""
+class SamplingSettings(Settings):
+    """Settings that every generator has.
+
+    Args:
+        batch_size: number of scans that are computed at once, always; the last batch is filled up with copies. Another
+            size sums in another order, so a seed gives the same scan only up to the last digits. 0 takes the system's
+            own, which is the quickest for many scans on its device; 1 is the quickest for one scan alone.
+    """
+
+    batch_size: Annotated[int, Bounds(0, _BATCH_AT_MOST)] = field(default=0, kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import Job, is_bundle, locate, named_folder
 from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
-from lidargrit.generation.facts import CAPABILITIES, Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import CAPABILITIES, Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.hub import located
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
@@ -27,7 +27,7 @@ from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
-SamplingT = TypeVar("SamplingT")
+SamplingT = TypeVar("SamplingT", bound=SamplingSettings)
 
 
 class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
@@ -42,11 +42,13 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     arguments on the generator's device, in evaluation mode and without gradients.
     """
 
-    Sampling: ClassVar[type] = NoSampling
+    Sampling: ClassVar[type] = SamplingSettings
     not_of_sampling: ClassVar[frozenset[str]] = frozenset()
     """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
 
     capabilities: ClassVar[frozenset[str]] = frozenset()
+    own_batches: ClassVar[tuple[int, int]] = (1, 8)
+    """Number of scans that are computed at once on a CPU, and on a GPU, where the caller names none."""
     is_random: ClassVar[bool] = True
     """Whether two seeds give two scans."""
     bundle: "Bundle[Generator[Any, Any]] | None" = None
@@ -113,13 +115,13 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         """Rows in which every ray returns, none in the others; None for a generator with raydrop."""
         return None
 
-    @property
-    def compute_batch(self) -> int:
-        """Number of scans that are computed at once, always; the last batch is filled up with copies.
+    def batch_size(self, sampling: SamplingT | None = None) -> int:
+        """Return the number of scans computed at once, always: a seed gives the same scan whatever else is asked for.
 
-        Kernels differ by the size of a batch, and a seed is to give the same scan whatever else is asked for.
+        The last batch is filled up with copies, for kernels differ by its size.
         """
-        return 1
+        asked_for = 0 if sampling is None else sampling.batch_size
+        return asked_for or self.own_batches[self.device.type != "cpu"]
 
     @property
     def device(self) -> torch.device:
@@ -178,7 +180,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             return self._completed(known, seeds, sampling)
         settings = self._settings(sampling, self.Sampling)
         return known.put_into(
-            in_batches(seeds, self.compute_batch, lambda at, some: self._sample(some, known[at], settings))
+            in_batches(seeds, self.batch_size(settings), lambda at, some: self._sample(some, known[at], settings))
         )
 
     @final
@@ -191,7 +193,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         self, seeds: Iterable[int], sampling: SamplingT | None = None, condition: Condition = NOTHING
     ) -> Iterator[RangeImage]:
         """Yield the scans of :meth:`sample` one by one; seeds may be without end, such as ``itertools.count(0)``."""
-        remaining, size = iter(seeds), self.compute_batch
+        remaining, size = iter(seeds), self.batch_size(sampling)
         for number, some in enumerate(iter(lambda: list(islice(remaining, size)), [])):
             images = self.sample(some, condition[number * size : (number + 1) * size], sampling)
             yield from (images[index] for index in range(len(images)))
@@ -238,7 +240,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         check_seeds(seeds, len(images))
         settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
         self.eval()
-        return in_batches(seeds, self.compute_batch, lambda at, some: self._invert(images[at], some, settings))
+        return in_batches(seeds, self.batch_size(settings), lambda at, some: self._invert(images[at], some, settings))
 
     @final
     @inference()
@@ -266,7 +268,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return ScanBits.cat([self._bits(image, steps, expected) for image in one_by_one(rounded)])
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: SamplingT) -> RangeImage:
-        """Generate one scan for each of ``compute_batch`` seeds; scans of copies at their end may be left out.
+        """Generate one scan for each seed of a batch; scans of copies at their end may be left out.
 
         The condition is of a type in :attr:`takes`, and no ``Observed``.
         """
@@ -301,22 +303,19 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         from lidargrit.scans.fills import fill_lacking  # noqa: PLC0415  loads scipy, and only this needs it
 
         settings = self._settings(sampling, self.completion_sampling)
-        shares = [(None, [*range(len(seeds))])]
-        if sampling is None and self.bundle is not None:
-            shares = self.bundle.shares(known)
+        bundle = self.bundle if sampling is None else None
+        shares = [(None, [*range(len(seeds))])] if bundle is None else bundle.shares(known)
         found: dict[int, RangeImage] = {}
         for run, indices in shares:
             some, own = known[indices], [seeds[index] for index in indices]
             if run is None:
-                part = in_batches(own, self.compute_batch, partial(self._complete_batch, some, settings))
+                size = self.batch_size(settings)
+                part = in_batches(own, size, lambda at, of, some=some: self._complete(some[at], of, settings))
             else:
                 part = run.to(self.device).sample(own, some)
             found |= {index: part[[at]] for at, index in enumerate(indices)}
         generated = RangeImage.cat([found[index] for index in range(len(seeds))])
         return known.put_into(fill_lacking(generated, known))
-
-    def _complete_batch(self, known: Observed, sampling: SamplingT, at: list[int], seeds: BatchSeeds) -> RangeImage:
-        return self._complete(known[at], seeds, sampling)
 
     def _settings(self, given: SamplingT | None, default: Callable[[], SamplingT]) -> SamplingT:
         if given is not None and not isinstance(given, self.Sampling):

@@ -13,7 +13,7 @@ from torch import Tensor
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.encoding_cache import EncodingCache, Frozen
-from lidargrit.generation.facts import Cost
+from lidargrit.generation.facts import Cost, SamplingSettings
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
@@ -39,7 +39,7 @@ PixelChoice = Literal["auto", "pixels", "bernoulli", "threshold"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DecodingOfTokens(Settings):
+class DecodingOfTokens(SamplingSettings):
     """Settings by which range images are made of sampled tokens, whatever samples the tokens.
 
     Args:
@@ -91,7 +91,7 @@ class TokenGeneratorConfig(Settings):
 
 
 TokenConfigT = TypeVar("TokenConfigT", bound=TokenGeneratorConfig)
-SamplingT = TypeVar("SamplingT")
+SamplingT = TypeVar("SamplingT", bound=SamplingSettings)
 
 
 class TokenGenerator(Generator[TokenConfigT, SamplingT]):
@@ -176,7 +176,7 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         all of them at once.
 
         Args:
-            tokens: tokens of ``compute_batch`` scans in raster order.
+            tokens: tokens of a batch of scans in raster order.
             wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
             mask: method by which returns and ranges are decided, checked by :meth:`check_choice`.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.

@@ -18,6 +18,31 @@ _SCAN_S = 2.0  # that no revolution lasts
 _ROTATION = 1e-3  # by which numbers of a file may miss an orthonormal matrix
 
 
+class Motion(NamedTuple):
+    """When and where a scan was made.
+
+    Args:
+        time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
+        pose: matrix from the sensor's frame to that of the recording; None if it is not known.
+    """
+
+    time_s: float | None = None
+    pose: Float64[Tensor, "4 4"] | None = None
+
+
+def transform_between(then: Float64[Tensor, "4 4"], now: Float64[Tensor, "4 4"]) -> Float64[Tensor, "4 4"]:
+    """Return the matrix from the sensor's frame at one pose to that at another, by sums in a fixed order.
+
+    Args:
+        then, now: matrices from the sensor's frame to that of the recording.
+    """
+    moved = then.clone()
+    moved[:3, 3] -= now[:3, 3]
+    products = now[:3, :3, None] * moved[:3, None]  # the inverse of a rotation is its transpose
+    moved[:3] = products[0] + products[1] + products[2]
+    return moved
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """The poses of a sensor over time; between two of them it turns and moves evenly.

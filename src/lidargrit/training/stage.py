@@ -21,6 +21,7 @@ from lidargrit.core.errors import ConfigError, Terminated, TrainingError
 from lidargrit.core.files import remove_partials
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import RangeImages
+from lidargrit.data.pasts import Pasts
 from lidargrit.data.run_folder import CHECKPOINT_FILE
 from lidargrit.generation.conditions import ToldOfScans
 from lidargrit.generation.conditions.nothing import NothingTold
@@ -143,6 +144,7 @@ class StageTraining:
             self.workers,
             self.condition.of,
             self.objective.keeps_encodings,
+            self.condition.past_scans,
         )
         begun = time.monotonic()
         progress_bar = reporting.progress(what, config.scans, self.scans_seen)
@@ -183,6 +185,7 @@ class StageTraining:
             Terminated: SIGTERM was received meanwhile; the resumed training validates again.
         """
         chosen = evenly_spaced(self.config.validation_scans, len(images))
+        pasts = Pasts(images, self.condition.past_scans) if self.condition.past_scans else None
         totals: dict[str, float] = {}
         # As many at once as a process has in a step, since more may not fit in memory.
         at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))
@@ -191,7 +194,7 @@ class StageTraining:
                 raise Terminated
             indices = chosen[first : first + at_once]
             batch = images.batch(indices)
-            example = Example(batch, self.condition.of(batch))
+            example = Example(batch, self.condition.of(batch) if pasts is None else pasts.of(indices))
             terms = self.engine.evaluate(self.average.objective, example, derive_seed(self.seed, 3, first))
             for name, value in terms.items():
                 totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)

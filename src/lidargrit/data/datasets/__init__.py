@@ -7,16 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import ClassVar, NamedTuple
-
-from jaxtyping import Float64
-from torch import Tensor
+from typing import ClassVar
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, printable
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
+from lidargrit.data.windows import TimedScan, drives_in
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.types import Scan
 
 _FILES_TO_LOOK_AT = 10_000  # of a folder without any scan that is read
@@ -36,18 +35,6 @@ class SplitScheme:
     source: str
     leak: str
     parts: Mapping[str, tuple[str, ...]]
-
-
-class Motion(NamedTuple):
-    """When and where a scan was made.
-
-    Args:
-        time_s: time in seconds, on one clock for all scans of a recording; None if it is not known.
-        pose: matrix from the sensor's frame to that of the recording; None if it is not known.
-    """
-
-    time_s: float | None = None
-    pose: Float64[Tensor, "4 4"] | None = None
 
 
 class ScanDataset(ABC):
@@ -131,10 +118,10 @@ class ScanDataset(ABC):
         return Motion()
 
     def windows(self, frames: int) -> "list[Window]":
-        """Return all runs of scans that follow one another in one recording, in order of time.
+        """Return all runs of scans that follow one another in one drive, in order of time.
 
-        Each run begins one scan after the one before it. Scans whose time is not known are in none. Where a recording
-        lacks scans, those around the gap follow one another, as their times tell.
+        Each run begins one scan after the one before it. Scans whose time is not known are in none; where a drive ends
+        early, see :func:`lidargrit.data.windows.drives_in`.
 
         Args:
             frames: number of scans in each run.
@@ -145,15 +132,10 @@ class ScanDataset(ABC):
         """
         if frames < 1:
             raise ConfigError(f"windows of {frames} scans", "at least 1", "correct it")
-        drives: dict[str, list[tuple[float, int]]] = {}
-        for index in range(len(self)):
-            time_s = self.motion(index).time_s
-            if time_s is not None:
-                drives.setdefault(self.recording(index), []).append((time_s, index))
-        ordered = [[index for _, index in sorted(drive)] for drive in drives.values()]
+        scans = [TimedScan(self.name(at), self.recording(at), self.motion(at)) for at in range(len(self))]
         return [
             Window(self, tuple(drive[first : first + frames]))
-            for drive in ordered
+            for drive in drives_in(scans, with_poses=False)
             for first in range(len(drive) - frames + 1)
         ]
 

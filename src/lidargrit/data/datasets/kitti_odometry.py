@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from lidargrit.core.errors import ScanError
-from lidargrit.data.datasets import Motion, SplitScheme
+from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.data.formats import read_bytes
 from lidargrit.scans.classes import notes_on_labels
 from lidargrit.scans.columns import usable_points
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.types import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper

@@ -5,9 +5,9 @@ from pathlib import Path
 import torch
 
 from lidargrit.core.errors import OutputError
-from lidargrit.data.datasets import Motion
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.formats.pandaset_pkl import sensor_poses
+from lidargrit.scans.motion import Motion
 
 
 class Pandaset(FileDataset):

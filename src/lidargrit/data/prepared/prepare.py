@@ -23,6 +23,7 @@ from lidargrit.data.prepared.imaging import choose_imaging
 from lidargrit.data.prepared.plan import ARRAYS, FORMAT, MADE_FOLDER, PLAN_FILE, SCANS_FILE, PreparedSpec, made_name
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages
 from lidargrit.data.prepared.workers import make_shards
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
 _SHARD_SCANS = 128  # 12 MB of KITTI-360 size images, and 625 files for 80,000 scans
@@ -168,8 +169,11 @@ def damaged_shards(folder: Path, rank: int | None = None, world_size: int | None
 
 def _spec(
     source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig
-) -> tuple[PreparedSpec, list[tuple[str, str, int, int]]]:
-    """Return the specification of the folder, and for every scan its name, drive, file size and time."""
+) -> tuple[PreparedSpec, list[tuple[Any, ...]]]:
+    """Return the specification of the folder, and of every scan its name, drive, and its file's size and time.
+
+    Where they are known, the time and the pose of the scan follow.
+    """
     fine, scans, beside = sensor.fine(), [], []
     for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
         path = dataset.path(index)
@@ -185,7 +189,7 @@ def _spec(
             else "".join((str(path.resolve()), *dataset.name(index).partition("#")[1:]))
         )
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
-        scans.append((name, dataset.recording(index), size, time_ns))
+        scans.append((name, dataset.recording(index), size, time_ns, *_time_and_pose(dataset, index)))
         beside += filter(None, map(_state, dataset.companions(index)))
     others = json.dumps(beside) if beside else ""
     # A file of a sensor by which scans are simulated may change, and its name stays the same.
@@ -208,6 +212,19 @@ def _spec(
     return spec, scans
 
 
+def _time_and_pose(dataset: ScanDataset, index: int) -> tuple[float, list[float] | None] | tuple[()]:
+    """Return the time and the pose of a scan as numbers; nothing where the time is not known.
+
+    Damaged files of poses count as none: images without a past need no pose.
+    """
+    motion = Motion()
+    with suppress(DataError):
+        motion = dataset.motion(index)
+    if motion.time_s is None:
+        return ()
+    return motion.time_s, None if motion.pose is None else motion.pose.flatten().tolist()
+
+
 def _state(path: Path) -> tuple[str, int, int] | None:
     """Return the name, the size and the time of a file that is read beside a scan; None if it is not there."""
     try:
@@ -217,7 +234,7 @@ def _state(path: Path) -> tuple[str, int, int] | None:
     return path.name, status.st_size, status.st_mtime_ns
 
 
-def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[str, str, int, int]]) -> None:
+def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[Any, ...]]) -> None:
     """Write the plan into a free folder, or check that the folder's plan is the same."""
     listing, path = json.dumps(scans), folder / SCANS_FILE
     if (folder / PLAN_FILE).exists():

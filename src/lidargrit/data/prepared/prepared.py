@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.core.files import read_json
 from lidargrit.core.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
-from lidargrit.data.images import ImageStore, Pixels, Provenance
+from lidargrit.data.images import ImageStore, Pixels, Provenance, TimedStore
 from lidargrit.data.prepared.arrays import ImageArrays, damaged, range_step_m, store_context, store_errors, store_of
 from lidargrit.data.prepared.plan import PLAN_FILE, PLANES, SCANS_FILE, MadeScans, PreparedSpec, made_name, pixels_name
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.sensors import SensorModel
 
 _OPENED_AT_ONCE = 16  # files: a store takes some hundredths of a second for each
@@ -38,6 +40,7 @@ class FewerColumns:
 
     def __init__(self, images: ImageStore, columns: int, wanted: int) -> None:
         self._images, self.provenance = images, images.provenance
+        self.motions = images.motions if isinstance(images, TimedStore) else (Motion(),) * len(images)
         new_column = (np.arange(columns) * 2 + 1) * wanted // (2 * columns)
         self._first = np.searchsorted(new_column, np.arange(wanted))
         self._counts = np.diff(self._first, append=columns)
@@ -146,6 +149,16 @@ def _is_named(scan: Any) -> bool:
     return isinstance(scan, list) and len(scan) >= 2 and isinstance(scan[0], str) and isinstance(scan[1], str)
 
 
+def _motion_of(scan: list[Any], path: str) -> Motion:
+    """Return when and where a scan of the list was made: the time and the 16 numbers of the pose that may end it."""
+    time_s, pose = scan[4:6] if len(scan) == 6 else (None, None)
+    try:
+        matrix = None if pose is None else torch.tensor(pose, dtype=torch.float64).view(4, 4)
+        return Motion(None if time_s is None else float(time_s), matrix)
+    except (TypeError, ValueError, RuntimeError):
+        raise DataError(f"{path} with a time or pose that is none", "numbers", _AGAIN) from None
+
+
 class PreparedImages:
     """The range images of a prepared folder.
 
@@ -186,6 +199,7 @@ class PreparedImages:
             tuple(image.fingerprint for image in self._images),
             tuple(image.range_fingerprint for image in self._images),
         )
+        self.motions = tuple(_motion_of(scans[image.scan], f"{location}/{SCANS_FILE}") for image in self._images)
 
     def __len__(self) -> int:
         return len(self._images)
@@ -219,6 +233,7 @@ class PreparedImages:
         """Return so many of the images, evenly spaced, without opening the folder again."""
         chosen, whole, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
         chosen._images = [self._images[index] for index in indices]
+        chosen.motions = tuple(self.motions[index] for index in indices)
         chosen.provenance = Provenance(
             *(
                 tuple(of[index] for index in indices)

@@ -10,9 +10,9 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Temperature, Weight
+from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
@@ -43,7 +43,7 @@ BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centim
 
 
 @dataclass(frozen=True)
-class PixelSampling(Settings):
+class PixelSampling(SamplingSettings):
     """Settings of sampling masks, and ranges from their mixtures.
 
     By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only

@@ -11,6 +11,7 @@ from lidargrit.core.errors import ConfigError, nearest_names
 from lidargrit.data.images import Provenance
 from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant, trained_on
 from lidargrit.data.sources.scan_sensor import other_sensor
+from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.nn.devices import usable_device
@@ -35,7 +36,7 @@ class Model:
 
     name: str
     generator: Generator[Any, Any]
-    sampling: object
+    sampling: SamplingSettings | None
     folder: Path | None = None
     projection: ProjectionOption = "sensor"
 
@@ -48,6 +49,11 @@ class Model:
     def projection_variant(self) -> ProjectionVariant:
         """Variant by which scans become range images."""
         return "exact" if self.folder is None else projection_variant(self.folder)
+
+    @property
+    def batch_size(self) -> int:
+        """Number of range images that the generator completes at once."""
+        return self.generator.batch_size(self.sampling)
 
     def complete(self, condition: Observed, seeds: Sequence[int]) -> RangeImage:
         """Return scans that keep what was observed, one for each seed, in the computer's memory."""

@@ -132,7 +132,7 @@ class _Completion:
 
     def write(self, jobs: Iterable[_Job]) -> "Iterator[Written]":
         """Complete scans and write them; yield what was written with each batch."""
-        for batch in _batches(jobs, self.model.generator.compute_batch):
+        for batch in _batches(jobs, self.model.batch_size):
             counts = np.zeros(3, dtype=np.int64)
             for job, images in zip(batch, _completed(self.model, batch, self.output.seed), strict=True):
                 counts += self._write_one(job, images)
@@ -230,7 +230,7 @@ def complete_scans(
             named = json.dumps(model.sensor.to_json()) if model.folder is None else ""
             settings = model.sampling, model.projection, device
             work = _Work(source, out, model.name, named, *settings, task, output, config)
-            size = model.generator.compute_batch
+            size = model.batch_size
             shares = [folder.missing[first : first + size] for first in range(0, len(folder.missing), size)]
             for count, some, left_out in each_done(
                 partial(_write_some, work), shares, ray=ray, on_gpus=device != "cpu"
@@ -309,7 +309,7 @@ def _return_share(model: Model, job: _Job, output: OutputConfig) -> Float[Tensor
     """Return how often each pixel of the model's own image returns, over samples that are not written themselves."""
     total = torch.zeros(job.condition.return_mask.shape[1:])
     remaining = iter(range(output.probability))
-    while turns := list(islice(remaining, model.generator.compute_batch)):
+    while turns := list(islice(remaining, model.batch_size)):
         condition = Observed.cat([job.condition[:1]] * len(turns))
         seeds = [scan_seed(output.seed, job.number, turn, 1) for turn in turns]
         total += complete_images(model, condition, seeds).return_mask.float().sum(0)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, reflectance_error, required_reflectance
@@ -142,7 +142,7 @@ class CompletionConfig(Settings):
     completion: CompletionNetworkConfig = field(default_factory=CompletionNetworkConfig)
 
 
-class Completion(Generator[CompletionConfig, NoSampling]):
+class Completion(Generator[CompletionConfig, SamplingSettings]):
     """A network between observed pixels: its range is a best guess, its mask is sampled.
 
     A scan of which nothing is observed is completed, too, but it never learned that: such scans all have the same
@@ -176,10 +176,10 @@ class Completion(Generator[CompletionConfig, NoSampling]):
         """Observations alone: it has no new scans to sample."""
         return frozenset({Observed})
 
-    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
         return self.completion.sample(condition, rngs_of(seeds))
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of two estimates of the range and all phases of the mask, counted while it is computed."""
         nothing = Observed.nothing(self.sensor, 1).to(self.device)
         with torch.no_grad(), FlopCounter() as counter:

@@ -16,7 +16,7 @@ from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Weight
 from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
-from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import flops_of
@@ -90,7 +90,7 @@ class DustyConfig(Settings):
 
 
 @dataclass(frozen=True)
-class DustySampling(Settings):
+class DustySampling(SamplingSettings):
     """Settings of sampling, and of the search for the latent of a scan.
 
     Args:

@@ -5,7 +5,7 @@ from typing import Literal
 
 from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.fills import fill
@@ -25,7 +25,7 @@ class InterpolationConfig(Settings):
     method: Literal["nearest", "linear", "triangulation"] = "triangulation"
 
 
-class Interpolation(Generator[InterpolationConfig, NoSampling]):
+class Interpolation(Generator[InterpolationConfig, SamplingSettings]):
     """A classical method, for any sensor: it learns nothing, and completes a scan in one way whatever the seed."""
 
     Config = InterpolationConfig
@@ -46,9 +46,9 @@ class Interpolation(Generator[InterpolationConfig, NoSampling]):
         """Observations alone: it has no new scans to sample."""
         return frozenset({Observed})
 
-    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
         return fill(self.config.method, condition).to(self.device)
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return no operations: there is no network."""
         return Cost(0, 0)

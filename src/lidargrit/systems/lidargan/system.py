@@ -12,7 +12,7 @@ from torch.func import functional_call
 from lidargrit.core.configuration import Settings
 from lidargrit.core.typed_values import Count
 from lidargrit.data.images import RangeImages
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import flops_of
@@ -55,7 +55,7 @@ class LidarGanConfig(Settings):
     initial_std: InitialStd = 0.02
 
 
-class LidarGan(Generator[LidarGanConfig, NoSampling]):
+class LidarGan(Generator[LidarGanConfig, SamplingSettings]):
     """A generative adversarial network over horizontal distance and height, of scans whose holes were filled.
 
     Every ray of its rows returns, and no ray of the others: see :attr:`full_rows`.
@@ -99,11 +99,11 @@ class LidarGan(Generator[LidarGanConfig, NoSampling]):
         """Return the losses of the network and of a discriminator."""
         return LidarGanObjective(self.decoder, self.image, self.config)
 
-    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: SamplingSettings) -> RangeImage:
         latents = normal_latents(seeds, self.config.latent_dim).to(self.device)
         return self.image.decode(self.decoder(latents))
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return one pass of the network."""
         return Cost(1, flops_of(self.decoder, (1, self.config.latent_dim)))
 

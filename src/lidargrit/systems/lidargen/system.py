@@ -13,7 +13,7 @@ from torch import Tensor
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.typed_values import Bounds, Positive
-from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.reflectance import reflectance_of_returns
@@ -72,7 +72,7 @@ class LidarGenConfig(Settings):
 
 
 @dataclass(frozen=True)
-class LangevinSampling(Settings):
+class LangevinSampling(SamplingSettings):
     """Settings of Langevin sampling, and of the window of ranges that count as returns.
 
     The published 232 levels, 5 steps and step size are those that the theory of Song and Ermon (2020) gives for 32x32

@@ -95,6 +95,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         weights_licence="no licence stated",
     )
     Sampling = TokenSampling
+    own_batches = (8, 32)  # a step for several scans takes little longer than for one
     published_files = tuple(_PUBLISHED_NETWORKS)
     capabilities = TokenGenerator.capabilities | {"complete"}
 
@@ -108,11 +109,6 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     def transformer_objective(self) -> Objective:
         """Return the likelihood of each token given those before it."""
         return NextToken(self.tokenizer, self.transformer)
-
-    @property
-    def compute_batch(self) -> int:
-        """Number of scans whose tokens are sampled at once; a step for several takes little longer than for one."""
-        return 8 if self.device.type == "cpu" else 32
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: TokenSampling) -> RangeImage:
         return self._by_tokens(None, rngs_of(seeds), seeds.num_asked_for, sampling)

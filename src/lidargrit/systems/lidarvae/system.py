@@ -13,7 +13,7 @@ from lidargrit.core.configuration import COUNTS_SCANS, Settings
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Weight
 from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
 from lidargrit.data.images import RangeImages
-from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import flops_of
@@ -61,7 +61,7 @@ class LidarVaeConfig(Settings):
 
 
 @dataclass(frozen=True)
-class VaeSampling(Settings):
+class VaeSampling(SamplingSettings):
     """Settings of completing and inverting scans; sampling itself has none.
 
     Args:

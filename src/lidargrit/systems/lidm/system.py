@@ -14,7 +14,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.typed_values import Bounds, Share
 from lidargrit.generation.encoding_cache import EncodingCache
-from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.tokenizers import CodebookTokenizer, Tokenizer, TokenizerConfig, make_tokenizer
@@ -100,7 +100,7 @@ class LidmConfig(Settings):
 
 
 @dataclass(frozen=True)
-class LidmSampling(Settings):
+class LidmSampling(SamplingSettings):
     """Settings of sampling latents and returns.
 
     Args:

@@ -13,7 +13,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import CheckpointError
 from lidargrit.core.typed_values import Bounds
 from lidargrit.generation.batches import BatchSeeds
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.nn.random import rngs_of
 from lidargrit.scans.condition import Condition
@@ -45,7 +45,7 @@ class ImageBatches(Protocol):
         ...
 
 
-class Marginal(Generator[MarginalConfig, NoSampling]):
+class Marginal(Generator[MarginalConfig, SamplingSettings]):
     """Samples every pixel from its own histogram of range and return, independently of all others.
 
     A metric that gives it a good score does not look at shapes. It has no stage to train by an objective: it counts,
@@ -53,6 +53,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
     """
 
     Config = MarginalConfig
+    own_batches = (_BATCH, _BATCH)  # the histograms are summed up once for all of them
     facts = SystemFacts(generates="range and raydrop, every pixel by itself")
     scans: Tensor
     counts: Tensor
@@ -91,12 +92,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
             raise CheckpointError(got, "0 to as many as there are scans", "restore the file, or train again")
         return generator
 
-    @property
-    def compute_batch(self) -> int:
-        """Number of scans that are sampled at once; the histograms are summed up once for all of them."""
-        return _BATCH
-
-    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: NoSampling) -> RangeImage:
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: SamplingSettings) -> RangeImage:
         if not int(self.scans):
             raise CheckpointError("a generator that has counted no scan", "one that has", "call fit_statistics first")
         edges = self._edges_m().to(self.counts.device)
@@ -111,7 +107,7 @@ class Marginal(Generator[MarginalConfig, NoSampling]):
             images.append(RangeImage.masked(low * (high / low) ** uniform[2], returned, self.sensor))
         return RangeImage.stack(images)
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return nothing: there is no network."""
         return Cost(0, 0)
 

@@ -13,7 +13,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import CheckpointError
 from lidargrit.core.typed_values import Bounds
 from lidargrit.data.images import RangeImages
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.scans.condition import Condition
@@ -32,7 +32,7 @@ class MemorisedConfig(Settings):
     scans: Annotated[int, Bounds(1, 100_000)] = 1000
 
 
-class Memorised(Generator[MemorisedConfig, NoSampling]):
+class Memorised(Generator[MemorisedConfig, SamplingSettings]):
     """Returns the ranges of training scans: the best score of a generator that learns nothing.
 
     A generator that scores better on held-out scans has learned something; one that scores the same may have learned
@@ -76,13 +76,13 @@ class Memorised(Generator[MemorisedConfig, NoSampling]):
             raise CheckpointError(got, "as many as it counts", "restore the file, or train again")
         return generator.eval()
 
-    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: NoSampling) -> RangeImage:
+    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: SamplingSettings) -> RangeImage:
         """Return the scan of each seed: as many seeds in a row as there are scans give each of them once."""
         if not int(self.scans):
             raise CheckpointError("a generator that has kept no scan", "one that has", "call fit_statistics first")
         range_m = self.range_m[torch.tensor([seed % int(self.scans) for seed in seeds])]
         return RangeImage(range_m, range_m > 0, self.sensor)
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return nothing: there is no network."""
         return Cost(0, 0)

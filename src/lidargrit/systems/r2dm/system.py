@@ -16,7 +16,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, NotNegative
 from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.data.images import RangeImages
-from lidargrit.generation.facts import Cost, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
@@ -53,7 +53,7 @@ class R2dmConfig(Settings):
 
 
 @dataclass(frozen=True)
-class DiffusionSampling(Settings):
+class DiffusionSampling(SamplingSettings):
     """Settings of sampling, and the rule by which a pixel is a return.
 
     Args:

@@ -15,6 +15,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.generation.encoding_cache import Frozen
+from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.flops import flops_of
@@ -34,7 +35,7 @@ _HUBER_SCALE = 0.00054  # times the root of the number of an image's values, as 
 
 
 @dataclass(frozen=True)
-class FlowSampling(Settings):
+class FlowSampling(SamplingSettings):
     """Settings of following the flow from noise to a scan.
 
     Args:
@@ -54,9 +55,10 @@ class FlowSampling(Settings):
         if self.solver == "euler" and self.tolerance != FlowSampling.tolerance:
             got = f"tolerance={self.tolerance:g} for solver=euler, which takes equal steps"
             raise ConfigError(got, "settings that have an effect", "leave it out, or add solver=dopri5")
-        if self.solver == "dopri5" and self.steps:
-            got = f"steps={self.steps} for solver=dopri5, which chooses its own"
-            raise ConfigError(got, "settings that have an effect", "leave it out, or add solver=euler")
+        for name in ("steps", "batch_size"):
+            if self.solver == "dopri5" and (number := getattr(self, name)):
+                got = f"{name}={number} for solver=dopri5, which takes steps of its own for each scan"
+                raise ConfigError(got, "settings that have an effect", "leave it out, or add solver=euler")
 
 
 @dataclass(frozen=True)

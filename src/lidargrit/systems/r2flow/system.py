@@ -85,6 +85,10 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         """Return two steps of Euler."""
         return FlowSampling(steps=2)
 
+    def batch_size(self, sampling: FlowSampling | None = None) -> int:
+        """Return 1 for a solver whose steps would depend on the other scans of a batch."""
+        return 1 if sampling is not None and sampling.solver == "dopri5" else super().batch_size(sampling)
+
     @property
     def stages(self) -> tuple[str, ...]:
         """The flow, its straightening, its distillation to few steps; the latter two if so configured."""

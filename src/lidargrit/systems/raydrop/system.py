@@ -11,7 +11,7 @@ from torch import Tensor
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.batches import BatchSeeds
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import reflectance_error, required_reflectance
@@ -106,7 +106,7 @@ class RaydropConfig(Settings):
     raydrop: RaydropNetworkConfig = field(default_factory=RaydropNetworkConfig)
 
 
-class Raydrop(Generator[RaydropConfig, NoSampling]):
+class Raydrop(Generator[RaydropConfig, SamplingSettings]):
     """A network over the ranges of all surfaces, which samples whether each of them returns; ranges stay as they are.
 
     Rays that are known not to return have no surface. There are no other scans that it could generate.
@@ -144,7 +144,7 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
         """Observations alone: it has no new scans to sample."""
         return frozenset({Observed})
 
-    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: NoSampling) -> RangeImage:
+    def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
         if not bool((condition.range_observed | condition.return_observed).all()):
             raise ConfigError(
                 "scans with rays of which nothing is known",
@@ -153,7 +153,7 @@ class Raydrop(Generator[RaydropConfig, NoSampling]):
             )
         return self.raydrop.sample(condition, rngs_of(seeds))
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of the features and of all phases of the mask, counted while they are computed."""
         range_m = torch.full((1, self.sensor.height, self.sensor.width), self.sensor.range_max_m)
         clean = RangeImage(range_m, range_m > 0, self.sensor).to(self.device)

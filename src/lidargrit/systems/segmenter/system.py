@@ -11,7 +11,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.batches import check_images, one_by_one
-from lidargrit.generation.facts import Cost, NoSampling, SystemFacts
+from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, required_reflectance
@@ -170,7 +170,7 @@ class SegmenterConfig(Settings):
     segmenter: SegmenterNetworkConfig = field(default_factory=SegmenterNetworkConfig)
 
 
-class Segmenter(Generator[SegmenterConfig, NoSampling]):
+class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
     """A network that tells of every return which of the 19 classes of SemanticKITTI's benchmark it is."""
 
     Config = SegmenterConfig
@@ -211,7 +211,7 @@ class Segmenter(Generator[SegmenterConfig, NoSampling]):
         found = [self.segmenter.classes(image) for image in one_by_one(images.to(self.device))]
         return images.with_planes(label=torch.cat(found).to(images.range_m.device))
 
-    def cost(self, sampling: NoSampling | None = None) -> Cost:
+    def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of labelling one scan, counted while it is computed."""
         with torch.no_grad(), FlopCounter() as counter:
             self.segmenter(torch.zeros(1, self.sensor.height, self.sensor.width, device=self.device))

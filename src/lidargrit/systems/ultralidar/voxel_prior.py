@@ -15,8 +15,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from lidargrit.core.configuration import Settings
 from lidargrit.core.typed_values import Bounds, NotNegative, ShareBelow1, Weight
+from lidargrit.generation.facts import SamplingSettings
 from lidargrit.nn.blocks import Network
 from lidargrit.systems.ultralidar.swin import SwinConfig, initialise_linear, sine_cosine_positions, swin_blocks
 
@@ -30,7 +30,7 @@ Fill = Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]]
 
 
 @dataclass(frozen=True)
-class FillSampling(Settings):
+class FillSampling(SamplingSettings):
     """Settings of filling hidden tokens in.
 
     Args:

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.files import read_text
-from lidargrit.data.datasets import Motion
+from lidargrit.scans.motion import Motion
 
 _POSE = "12 finite numbers in each row, the first three rows of a pose"
 
