@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
     add_count(parser, help="largest number of scans; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="half-samples for 95 %% intervals; 0 for none")
-    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which a model has to beat")
+    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which models must beat")
     add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples")
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
     add_device(parser)
