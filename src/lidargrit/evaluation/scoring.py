@@ -48,7 +48,7 @@ class Cluster:
     """A Ray cluster that feeds metrics, a group of scans a task.
 
     Args:
-        ray: its address; see :func:`each_done`.
+        ray: address of the cluster; see :func:`each_done`.
         open_pair: function that opens the two sets on one of its machines.
         on_gpus: whether a task takes a GPU.
     """
