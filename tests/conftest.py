@@ -3,6 +3,7 @@
 import compileall
 import copy
 import functools
+import gc
 import inspect
 import itertools
 import json
@@ -32,6 +33,7 @@ settings.load_profile("unhurried")
 # made, which spares each of the many child processes half a second, and write none.
 compileall.compile_dir(Path(lidargrit.__file__).parent, quiet=2)
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+gc.disable()  # a quarter of the time to collect tests was spent on looking for circles among things that stay
 torch.set_num_threads(1)  # two threads while another process runs can be many times slower
 
 with_shapes_checked = jaxtyping.jaxtyped
@@ -67,6 +69,11 @@ def checked(function: type | Callable, typechecker: Callable) -> type | Callable
     return called
 
 
+def pytest_collection_finish():
+    gc.freeze()
+    gc.enable()
+
+
 @pytest.fixture(autouse=True)
 def _next_test():
     global running_test  # noqa: PLW0603  that of this process
@@ -87,23 +94,27 @@ def _cache(tmp_path_factory):
 
 @pytest.fixture(scope="session", autouse=True)
 def _streets():
-    """Simulate each street of a source such as ``simulated:4`` once for all tests that read it in one process."""
-    from lidargrit.data.datasets.simulated import Simulated  # now its functions come with their checks
+    """Simulate each street that data sets read or write, or a script asks for, once for all tests in one process.
 
-    simulated, kept = Simulated.scan, OrderedDict()
+    Tests of the simulator import the function itself.
+    """
+    from lidargrit.simulator import simulate  # now its functions come with their checks
 
-    @functools.wraps(simulated)
-    def scan(streets, index):
-        street = (streets.seeds[index], json.dumps(streets.made_by.to_json()))
+    kept = OrderedDict()
+
+    @functools.wraps(simulate)
+    def simulate_once(seed, sensor=None, **options):
+        street = (seed, sensor and json.dumps(sensor.to_json()), repr(options))
         found = kept.get(street)  # threads may ask at once
         if found is None:
-            found = kept[street] = simulated(streets, index)
+            found = kept[street] = simulate(seed, sensor, **options)
             if len(kept) > STREETS_KEPT:
                 kept.popitem(last=False)
         return copy.deepcopy(found)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Simulated, "scan", scan)
+        patch.setattr("lidargrit.simulator.simulate", simulate_once)
+        patch.setattr("lidargrit.simulate", simulate_once)
         yield
 
 

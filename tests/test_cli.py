@@ -19,12 +19,10 @@ from lidargrit.cli import build_parser, main
 from lidargrit.core import discovery
 from lidargrit.data.datasets import load
 from lidargrit.data.formats import read_scan as read_bin
-from lidargrit.data.sources import load_range_images
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.generation.presets import load_preset
-from lidargrit.viewer.demo import divided
 from tiny_runs import MODEL, the_one_line
 
 TINY = [
@@ -146,10 +144,10 @@ def test_every_preset_has_a_plan(preset, tmp_path, capsys, monkeypatch):
     if preset not in COUNTED:
         monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     monkeypatch.chdir(tmp_path)
-    is_simulated = load_preset(preset).data.train[0].startswith("simulated")
-    assert main(["train", preset, "none", "--dry-run"]) == (0 if is_simulated else 2)
+    name, root, _ = load_preset(preset).data.train[0].split(":")
+    assert main(["train", preset, "none", "--dry-run"]) == (0 if name == "simulated" else 2)
     captured = capsys.readouterr()
-    assert ("data/kitti" in captured.err) is not is_simulated, "where data sets are looked for"
+    assert (root in captured.err) is not (name == "simulated"), "where data sets are looked for"
     assert "published: " in captured.out
     assert (" parameters, " in captured.out) == bool(load_preset(preset).training)
 
@@ -329,14 +327,6 @@ def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
     for content in (before, again):
         content["evaluation.json"] = re.sub(of_time, b"", content["evaluation.json"])
     assert again == before
-
-
-def test_demo_on_one_drive_holds_its_last_scans_out_and_warns(tmp_path, heard):
-    load("kitti_odometry").write_example(tmp_path / "tree", 8)
-    data = divided(str(tmp_path / "tree" / "sequences" / "00"))
-    assert any("WARNING: the last scans are held out" in line for line in heard)
-    assert (data.train[0][-6:], data.val[0][-6:]) == ("[:85%]", "[85%:]")
-    assert [len(load_range_images(sources, data)) for sources in (data.train, data.val)] == [3, 1]
 
 
 def test_python_and_the_command_line_do_the_same(run_folder, samples):

@@ -1,6 +1,5 @@
 """What every data set promises; a new file in datasets/ is tested here without a test being written."""
 
-import functools
 from pathlib import Path
 
 import pytest
@@ -11,20 +10,10 @@ from lidargrit.core.errors import DataError, OutputError, UnknownNameError
 from lidargrit.data.datasets import ScanDataset, load, open_dataset, recognise
 from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.simulator import simulate
 
 NAMES = discovery.names("datasets")
 READ_ONLY = {"ncore", "ouster", "pandaset", "py123d"}
 ROOT = Path("4")  # a folder for those that read files, a count for the simulated one
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _streets_are_simulated_once():
-    """Trees of several data sets hold the same streets: they differ in how files lie, not in what these hold."""
-    once = functools.cache(lambda seed, name: simulate(seed=seed, sensor=load_sensor(name)))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidargrit.simulator.simulate", lambda seed, sensor: once(seed, sensor.name))
-        yield
 
 
 @pytest.fixture(scope="module", params=NAMES)

@@ -1,7 +1,10 @@
 """The demo: which networks it trains, on whose scans, and what it says of that."""
 
+import shutil
+
 from lidargrit.core import reporting
 from lidargrit.data.datasets import load
+from lidargrit.data.sources import load_range_images
 from lidargrit.generation.settings import Preset
 from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.viewer import demo
@@ -29,9 +32,14 @@ def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):
         assert words == "The tokenizer, the transformer and the pixel decoder learn anew here."
         assert ("another sensor" in said) != anew
         assert demo._sampling(preset) == demo._SHARPER
-    load("kitti_odometry").write_example(tmp_path / "tree", 8)
+    load("kitti_odometry").write_example(tmp_path / "tree", 1)
+    (scan,) = (tmp_path / "tree" / "sequences" / "00" / "velodyne").iterdir()
+    for number in range(1, 4):
+        shutil.copy(scan, scan.with_stem(f"{number:06d}"))
     preset, _, said = chosen(data=str(tmp_path / "tree" / "sequences" / "00"))
     assert "WARNING: the last scans are held out" in said
-    assert preset.data.val[0].endswith("[85%:]")
+    assert (preset.data.train[0][-6:], preset.data.val[0][-6:]) == ("[:85%]", "[85%:]")
+    divided = (preset.data.train, preset.data.val)
+    assert [len(load_range_images(sources, preset.data)) for sources in divided] == [3, 1]
     assert preset.start_runs == dict.fromkeys(("tokenizer", "transformer", "pixels"), "pretrained")
     assert not preset.frozen

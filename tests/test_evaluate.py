@@ -23,7 +23,7 @@ from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import pair_for_protocol
 from lidargrit.evaluation.protocols import MetricChoice, Protocol, load_protocol
 from lidargrit.evaluation.scorecard import Scorecard, format_value
-from lidargrit.evaluation.tables import published, read_tables, side_by_side
+from lidargrit.evaluation.tables import published, side_by_side
 from lidargrit.scans.sensors import load_sensor
 from tiny_runs import the_one_line
 
@@ -83,7 +83,7 @@ def test_a_protocol_asks_for_what_there_is(name):
     for choice in protocol.metrics:
         assert choice.variant in load_metric(choice.metric).variants
     sensor = protocol.load_sensor()
-    assert (sensor is None) == (name in ("exact", "objects", "streets"))
+    assert (sensor is None) == (name in ("drive", "exact", "forecast", "objects", "streets"))
     if sensor is not None:
         rows = 32 if protocol.data_set == "nuscenes" else 64
         assert (sensor.height, sensor.width) == (rows, 256 if name.endswith("odometry") else 1024)
@@ -190,14 +190,7 @@ def test_words_of_reading_scans_are_obeyed_or_refused(tmp_path, capsys):
     error = the_one_line(capsys.readouterr().err, "evaluate")
     assert "got the run pretrained, which holds no scans" in error
     assert "lidargrit likelihood simulated:2:test --model pretrained" in error
-    for words, got in (
-        (["samples", "--tables", "a.json"], "samples beside --tables"),
-        (["--tables", "a.json", "--protocol", "r2dm"], "--protocol beside --tables"),
-        (["--tables", "a.json", "-n", "3"], "--count beside --tables"),
-        (["--tables", "a.json", "--set", "data.columns=64"], "--set beside --tables"),
-        (["a", "b", "--table", "latex"], "--table without --tables"),
-        (["a", "b", "--report", str(tmp_path / "r.png")], "r.png, which will hold HTML"),
-    ):
+    for words, got in ((["a", "b", "--report", str(tmp_path / "r.png")], "r.png, which will hold HTML"),):
         assert main(["evaluate", *words]) == 2
         assert got in the_one_line(capsys.readouterr().err, "evaluate")
 
@@ -224,15 +217,14 @@ def test_files_of_one_name_are_told_apart_and_rows_complete_each_other(card, tmp
     for path, scores in zip(paths, (card.scores[:1], card.scores), strict=True):
         path.parent.mkdir()
         write_json(path, replace(card, scores=scores).to_json())
-    table, of = read_tables(paths)
-    assert list(of) == [str(path.with_suffix("")) for path in paths]
+    table = render(side_by_side(paths))
     assert all(str(path.with_suffix("")) in table for path in paths)
     (real,) = (line for line in table.splitlines() if line.startswith("(real against real"))
     assert all(format_value(score.real_against_real.value) in real for score in card.scores)
     bounds = [path.with_name("marginal.json") for path in paths]
     for path in bounds:
         write_json(path, card.to_json())
-    table, _ = read_tables([*paths, *bounds])
+    table = render(side_by_side([*paths, *bounds]))
     assert table.count("marginal (pixel statistics)") == 2
     assert not re.search(r"marginal: (Better|Within)", table)
 
@@ -368,8 +360,6 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
     assert " ".join(head.split()) == "metric variant score 95 % interval real against real better scans"
     assert len(rows) == 2
     assert (tmp_path / "s.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert main(["evaluate", "--tables", str(tmp_path / "s.json"), "--table", "latex"]) == 0
-    assert "tabular" in capsys.readouterr().out
     for wrong, message in (
         ([*words, *files], "there already"),
         (["evaluate", sets[0]], "alone; wanted samples and what they are compared with"),

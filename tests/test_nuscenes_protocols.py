@@ -13,6 +13,7 @@ from lidargrit.evaluation.comparison import EvalConfig, compare_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import grid_of_points_m
 from lidargrit.evaluation.protocols import load_protocol
+from lidargrit.generation.presets import load_preset
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 
@@ -32,15 +33,16 @@ def street(seed, tilt_deg=0.0):
 
 
 def pixels_of_the_program(xyz):
-    """Nearest range of each pixel, by the formulas of load_points_as_images; points outside the field are left out."""
+    """Nearest range of each pixel by the formulas of load_points_as_images, which puts what lies beyond the field into
+    the outer rows, and looks at the limits last."""
     found = {}
     for x, y, z in xyz.astype(np.float64):
         range_m = math.sqrt(x * x + y * y + z * z)
-        row = math.floor((1 - (math.asin(z / range_m) + math.radians(30)) / math.radians(40)) * ROWS)
+        row = math.floor((1 - (math.asin(z / (range_m + 1e-6)) + math.radians(30)) / math.radians(40)) * ROWS)
         column = math.floor(((-math.atan2(y, x) / math.pi + 1) / 2 % 1) * COLUMNS)
-        if 0 <= row < ROWS and 1.45 <= range_m <= 80:
-            found[row, column] = min(range_m, found.get((row, column), math.inf))
-    return found
+        pixel = min(max(row, 0), ROWS - 1), column
+        found[pixel] = min(range_m, found.get(pixel, math.inf))
+    return {pixel: range_m for pixel, range_m in found.items() if 1.45 <= range_m <= 80}
 
 
 def cells(pixels):
@@ -69,22 +71,49 @@ def test_the_published_protocol_against_a_loop_over_points():
     assert {row for one in pixels for row, _ in one} == set(range(ROWS)) - {7, 23}, "lasers at 0 and -20 degrees"
     raised = pixels_of_the_program(street(0, 0.05)[0])
     assert {row for row, _ in raised} == set(range(ROWS)) - {8, 24}, "the same, a little higher"
-    sensor = load_sensor("hdl32e_nuscenes")
-    image = lidargrit.project(clouds[0], sensor)
+    sensor, protocol = load_sensor("hdl32e_nuscenes"), load_protocol("lidarcrafter")
+    image = lidargrit.project(clouds[0], sensor, variant=protocol.variant)
     ours = {(int(row), int(column)): float(image.range_m[row, column]) for row, column in image.return_mask.nonzero()}
     assert ours == pytest.approx(pixels[0], rel=1e-6)
     sums = [sum(map(cells, some)) for some in (pixels[:2], pixels[2:])]
     card = lidargrit.evaluate(clouds[:2], clouds[2:], "lidarcrafter", ["bev_jsd"], sensor=sensor)
     assert card.scores[0].result.value == pytest.approx(divergence_root(*sums), rel=1e-6)
-    assert any(
-        "compares with scans of the training split" in fault for fault in load_protocol("lidarcrafter").departures
+    assert any("compares with scans of the training split" in fault for fault in protocol.departures)
+    assert protocol.splits[0] == "train"
+
+
+def test_of_clouds_the_first_26000_points_alone_are_scored(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("samples", "real"):
+        (tmp_path / name).mkdir()
+        for number in range(2):
+            cloud = np.concatenate([street(int(seed), -0.05)[0] for seed in rng.integers(0, 99, 5)])  # 32,000 points
+            np.save(tmp_path / name / f"{number}.npy", cloud)
+    read = {name: [np.load(tmp_path / name / f"{number}.npy") for number in range(2)] for name in ("samples", "real")}
+    # as fix_points_num does; the program pads shorter clouds with points at the sensor, which no cell counts
+    sums = [
+        sum(cells(pixels_of_the_program(cloud[:most])) for cloud in read[name])
+        for name, most in (("samples", 26000), ("real", None))
+    ]
+    settings = EvalConfig("lidarcrafter", ("bev_jsd",), resampling=Resampling(halves=0), data=DataConfig(workers=1))
+    sets = [str(tmp_path / name) for name in ("samples", "real")]
+    wanted = divergence_root(*sums)
+    card, _ = compare_sources(*sets, settings)
+    assert any("the first 26,000 points alone" in warning for warning in card.warnings)
+    assert card.scores[0].result.value == pytest.approx(wanted, abs=2e-4), "prepared ranges are rounded to 2 mm"
+    in_memory = lidargrit.evaluate(
+        read["samples"], read["real"], "lidarcrafter", ["bev_jsd"], sensor=load_sensor("hdl32e_nuscenes")
     )
+    assert in_memory.scores[0].result.value == pytest.approx(wanted, rel=1e-6)
+    whole = sum(cells(pixels_of_the_program(cloud)) for cloud in read["samples"])
+    assert abs(divergence_root(whole, sums[1]) - wanted) > 0.01, "the cut changes the score"
 
 
 def test_the_fair_protocol_has_a_row_for_each_laser():
     xyz, laser = street(0)
     sensor = load_protocol("fair-nuscenes").load_sensor()
     assert sensor is not None
+    assert sensor.same_rays(load_preset("r2dm_nuscenes").data.load_sensor())
     assert (sensor.height, sensor.width, sensor.projection) == (ROWS, COLUMNS, "unfolding")
     image = lidargrit.project(Scan(torch.from_numpy(xyz), ring=torch.from_numpy(laser)), sensor)
     assert image.return_mask.sum(dim=1).tolist() == [AZIMUTHS] * ROWS

@@ -184,8 +184,8 @@ def test_the_verb(tmp_path, capsys, monkeypatch):
         ([*few, "-n", "1"], "got 1 simulated scan; wanted at least 2"),
         (["evaluate", "simulated:2@vlp16", *few[2:]], "got streets of 'vlp16' and scans of 'hdl64e_kitti_odometry'"),
         ([*few, "--pixel-statistics"], "got --pixel-statistics with --protocol streets"),
-        (["evaluate", "simulated:2", "simulated:2:val", "--model", "pretrained"], "got --model without --tables"),
-        ([*few[:3], "--beside", "simulated:2"], "got --beside without --tables"),
+        (["evaluate", "simulated:2", "simulated:2", "--model", "pretrained"], "got --model without --protocol streets"),
+        ([*few[:3], "--beside", "simulated:2"], "got --beside without --protocol streets"),
         ([*few, "--beside", "nowhere"], "got nowhere, which"),
         ([*few, "--report", str(tmp_path / "curves.html")], "curves.html, which will hold"),
     ):

@@ -22,7 +22,8 @@ from lidargrit.data.sources.sample_formats import (
     recognise,
     sensor_of_tensors,
 )
-from lidargrit.scans.projection import unproject
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.types import Scan
 
 SIZE = (64, 1024)
 
@@ -52,9 +53,48 @@ def lidargrit(range_m, reflectance):
 WRITERS = {"r2dm": r2dm, "lidargen": lidargen, "lidargrit": lidargrit}
 
 
+def write_lidm(path, range_m):
+    """Write the text of LiDM's custom_to_pcd: the returns of its limits, on the first edges of their pixels."""
+    row, column = (range_m > 0).nonzero().double().T
+    yaw, pitch = torch.pi * (2 * column / SIZE[1] - 1), torch.deg2rad(3 - 28 * row / SIZE[0])
+    metres = range_m[range_m > 0]
+    points = torch.stack((yaw.cos() * pitch.cos() * metres, -yaw.sin() * pitch.cos() * metres, pitch.sin() * metres), 1)
+    np.savetxt(path, np.hstack([points.numpy(), np.zeros(points.shape)]), fmt="%.3f")
+
+
+def test_clouds_on_the_edges_of_pixels_keep_their_pixels(tmp_path):
+    for index in (0, 1):
+        write_lidm(tmp_path / f"samples_{index:06}.txt", scan(index)[0])
+    assert is_tensor_folder(tmp_path)
+    assert recognise(tmp_path) == "lidm"
+    images = open_images(str(tmp_path))
+    assert images.sensor.name == "hdl64e_kitti_360"
+    batch = images.batch([0, 1])
+    for index in (0, 1):
+        assert torch.allclose(batch.range_m[index], scan(index)[0], atol=2e-3), "text has millimetres"
+    points = torch.from_numpy(np.loadtxt(tmp_path / "samples_000000.txt")[:, :3]).float()
+    plainly = project(Scan(points), images.sensor)
+    assert int(plainly.return_mask.sum()) < 0.8 * len(points), "what a projection of these points would lose"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("1.000 2.000 0.000 0.000 0.000 0.000\n1.000 2.000\n", "which cannot be used"),
+        ("1.000 2.000 0.000 0.000 0.000 0.000\n1.000 2.000 nan 0 0 0\n", "rows of 6 numbers"),
+        ("10.000 0.037 0.019 0.000 0.000 0.000\n", "pixels away from edges"),
+        ("0.000 0.000 0.000 0.000 0.000 0.000\n", "no point in"),
+    ],
+)
+def test_other_text_is_refused_in_one_line(text, line, tmp_path):
+    (tmp_path / "0.txt").write_text(text)
+    with pytest.raises(ScanError, match=line):
+        open_images(str(tmp_path))
+
+
 def test_every_sample_format_is_tested():
-    assert sorted(WRITERS) == discovery.names("sample-formats")
-    for name in WRITERS:
+    assert sorted([*WRITERS, "lidm"]) == discovery.names("sample-formats")
+    for name in discovery.names("sample-formats"):
         assert load_sample_format(name).source
         assert 20 < len(discovery.summary("sample-formats", name)) < 180
 

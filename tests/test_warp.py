@@ -86,7 +86,7 @@ def slow_warp(past: Past, one: int) -> dict[str, np.ndarray]:
             offset = 2 * math.asin(np.linalg.norm(point / distance - ray) / 2)
             close = aside[column_to] <= column_rad / 2
             found.append((to, column_to, new, past.ages_s[one, at].item(), abs(cosine), offset, close, at))
-    layers = {name: np.zeros((4, 5, 12)) for name in ("last", "nearest", "aligned")}
+    layers = {name: np.zeros((4, 5, 12)) for name in ("last", "nearest", "aligned", "surface")}
     for to in range(5):
         for column in range(12):
             here = [hit for hit in found if hit[:2] == (to, column)]
@@ -97,6 +97,10 @@ def slow_warp(past: Past, one: int) -> dict[str, np.ndarray]:
             }
             for name, hit in chosen.items():
                 layers[name][:, to, column] = 0 if hit is None else hit[2:6]
+            if about := chosen["nearest"] or chosen["aligned"]:
+                on_it = [hit[2] for hit in here if abs(hit[2] - about[2]) <= 0.05 + 0.02 * about[2]]
+                spread = np.abs(np.array(on_it) - np.mean(on_it)).mean()
+                layers["surface"][:3, to, column] = np.mean(on_it), spread, len(on_it)
     counts = [[len({hit[7] for hit in found if hit[:2] == (r, c) and hit[6]}) for c in range(12)] for r in range(5)]
     return {**layers, "scans": np.array(counts)}
 
@@ -117,6 +121,9 @@ def test_all_layers_are_those_of_a_slow_loop():
             np.testing.assert_allclose(torch.stack([*layer], 1)[one, :3], slow[name][:3], rtol=1e-6, atol=1e-6)
             # Our offset is the chord, as long as the angle for small ones.
             np.testing.assert_allclose(layer.offset_rad[one], slow[name][3], rtol=2e-3, atol=1e-6)
+        surface = torch.stack([part[one].double() for part in warped.surface])
+        assert int((surface[2] > 1).sum()) > 5
+        np.testing.assert_allclose(surface, slow["surface"][:3], rtol=1e-6, atol=1e-6)
         assert (warped.scans[one].numpy() == slow["scans"]).all()
     assert torch.equal(warped.copied_m, past.range_m[:, -1, :, ::STRIDE].double())
 

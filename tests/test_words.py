@@ -20,7 +20,7 @@ MISTAKES = {
     "sample run out -x": "got the option '-x'; wanted one such as",
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
-    "evaluate a b --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
+    "compare out a --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
     "list metric": "wanted one such as metrics; see: lidargrit list --help",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol or --projection; write it out",
@@ -103,19 +103,11 @@ def test_json_is_all_of_standard_output_or_a_file_besides(words, capsys, tmp_pat
 
 
 def test_every_verb_that_reports_knows_json():
-    silent = {"complete", "demo", "export", "import-weights", "publish", "raydrop", "sample", "serve"}
+    silent = {"complete", "demo", "export", "forecast", "import-weights", "publish", "raydrop", "sample", "serve"}
     silent |= {"compress", "decompress", "fine-tune", "rescan", "simulate", "upsample", "view"}
     parsers = {parser.prog.split()[1]: parser for parser in build_parser().verbs()}
     assert parsers.keys() == {name.replace("_", "-") for name in discovery.names("cli")}
     assert {name for name, parser in parsers.items() if "--json" not in parser.format_help()} <= silent
-
-
-def test_scores_side_by_side_as_json(capsys, tmp_path):
-    words = "evaluate simulated:2:val simulated:2:test --metrics bev_jsd --json one.json"
-    assert main(words.split()) == 0
-    capsys.readouterr()
-    assert main(["evaluate", "--tables", "one.json", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"one": json.loads((tmp_path / "one.json").read_text())}
 
 
 def test_help_tells_the_exit_codes(capsys):

@@ -10,26 +10,24 @@ from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
 if TYPE_CHECKING:
     from lidargrit.evaluation.comparison import EvalConfig
 
-_OF_TABLES = ("tables", "table")
 _OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
 _OF_REFERENCE = ("samples", "protocol", "count", "device", *SCANS)
 _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
 def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callable[[], None] | None]:
-    """Score by the options, or read what was scored; simulated streets have a picture in place of a page."""
+    """Score by the options; simulated streets have a picture in place of a page."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.evaluation.comparison import compare_sources, read_config
+    from lidargrit.evaluation.protocols import public_name
     from lidargrit.evaluation.raydrop import evaluate_streets, streets_of
     from lidargrit.evaluation.reference_file import ENDING
-    from lidargrit.evaluation.tables import read_tables
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
 
-    if options.tables:
-        refuse_unused(options, "beside --tables", _OF_TABLES)
-        return *read_tables(options.tables, options.table), None
+    if public_name(options.protocol) in ("forecast", "drive"):
+        return *_of_drives(options), None
     names = ("protocol", "device", *_OF_CARDS)
     config = read_config(
         scan_settings(options, max_scans=options.count), **{name: vars(options)[name] for name in names}
@@ -42,7 +40,7 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
         raise ConfigError(f"--report with {sets[1]}, which holds no scan", "scans to show", "leave it out")
     streets = streets_of(options.samples, config) if options.reference and not sets[1].endswith(ENDING) else None
     if streets is None:
-        refuse_unused(options, "without --tables or --protocol streets", ("ray", *_OF_BOTH, *_OF_CARDS))
+        refuse_unused(options, "without --protocol streets", ("ray", *_OF_BOTH, *_OF_CARDS))
         refuse_to_overwrite(options.report, options.overwrite, ".html")
         card, pair = compare_sources(*sets, config, options.ray)
         report = partial(write_report, card, pair, options.report) if options.report else None
@@ -52,6 +50,28 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     text, values, curves = evaluate_streets(sets[0], streets, sets[1], config, options.model, options.beside)
     plot = partial(plot_curves, curves, options.report, f"real: {options.reference}") if options.report else None
     return text, values, plot
+
+
+def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
+    """Score forecasts of drives, or how well the scans of one or two sets of drives fit together."""
+    from lidargrit.core.errors import UsageError
+    from lidargrit.evaluation.comparison import read_config
+    from lidargrit.evaluation.drives import evaluate_drives, evaluate_forecast
+    from lidargrit.evaluation.protocols import public_name
+
+    config = read_config(
+        scan_settings(options, max_scans=options.count), protocol=options.protocol, device=options.device
+    )
+    if not options.samples:
+        raise UsageError(
+            "no drives", "their folder or source", "name it, as in lidargrit evaluate DRIVES --protocol drive"
+        )
+    used = ("samples", "protocol", "count", "device", *SCANS)
+    if public_name(options.protocol) == "forecast":
+        refuse_unused(options, "with --protocol forecast", (*used, "model"))
+        return evaluate_forecast(options.samples, config, options.model)
+    refuse_unused(options, "with --protocol drive", (*used, "reference"))
+    return evaluate_drives([*filter(None, (options.samples, options.reference))], config)
 
 
 def _saved(options: argparse.Namespace, config: "EvalConfig") -> tuple[str, dict[str, Any]]:

@@ -106,7 +106,7 @@ def refuse_unused(options: argparse.Namespace, when: str, takes: Collection[str]
 
     Args:
         options: parsed options of the verb.
-        when: words for the mode, such as "with --tables".
+        when: words for the mode, such as "with --protocol streets".
         takes: names of what it takes then.
     """
     for action in options.words._actions:

@@ -1,11 +1,11 @@
-"""Score samples or simulated streets against real scans, or print saved scores side by side."""
+"""Score samples or simulated streets against real scans."""
 
 import argparse
 from pathlib import Path
 
 from lidargrit.cli._evaluation import evaluated
 from lidargrit.cli._options import add_count, add_device, add_ray, add_scans
-from lidargrit.cli._results import add_json, add_table, files_told, print_result, refuse_taken
+from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
 EXAMPLES = """\
@@ -14,13 +14,13 @@ EXAMPLES = """\
   lidargrit evaluate r2dm_samples kitti_360:/data/kitti_360 --protocol r2dm --weights pointnet=cls_model_39.pth
   lidargrit evaluate simulated:32:test /data/held_out --protocol streets --report curves.png    the simulator
   lidargrit evaluate kitti_360:/data/kitti_360:test --protocol r2dm --save-reference test.lgref    scores need no data
-  lidargrit evaluate --tables ours.json theirs.json --table markdown
+  lidargrit evaluate drives --protocol forecast    each scan of a drive from the five before it
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    samples = "samples of lidargrit or of another program (.pth), or a source of scans"
+    samples = "samples (.pth of others, too), or a source of scans"
     add("samples", nargs="?", default="", help=samples)
     reference = "scans to compare with, projected with the sensor of the samples; or their .lgref"
     add("reference", nargs="?", default="", help=reference)
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_device(parser)
     add_ray(parser)
     add_scans(parser)
-    add("--model", default="", metavar="RUN", help="raydrop model beside the simulator's (streets)")
+    add("--model", default="", metavar="RUN", help="model of raydrop (streets) or of drives (forecast)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
     add(
         "--save-reference",
@@ -47,8 +47,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
     add_json(parser, "the files of --json, --report and --save-reference")
-    add("--tables", nargs="+", type=Path, metavar="JSON", help="only print saved scores side by side")
-    add_table(parser)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -6,15 +6,12 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words
 from lidargrit.cli._results import look_at
-from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import seed_number, seeds_in_a_row
+from lidargrit.core.errors import ConfigError, counted_scans
+from lidargrit.core.untrusted import seed_number, seeds_in_a_row, whole_number
 
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
-  lidargrit sample pretrained_wide samples -n 8           by another, 64x1024
-  lidargrit sample runs/demo samples -n 100
-  lidargrit sample runs/demo bolder -n 100 --set sampling.temperature=1.1 sampling.mask=threshold
-  lidargrit sample runs/demo as_released -n 100 --set sampling.top_k=100
+  lidargrit sample runs/forecaster drives -n 2 --frames 100 --path poses.txt           two drives of ten seconds
   torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
 
@@ -25,6 +22,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
+    parser.add_argument("--frames", type=whole_number, default=0, metavar="N", help="scans in a row of each drive")
+    parser.add_argument("--path", type=Path, help="poses of a drive: TUM's rows, or a KITTI sequence (else straight)")
     add_settings(parser, "settings of sampling, such as sampling.temperature=1.1; see: lidargrit list generators")
     add_rank(parser, "process")
     add_ray(parser)
@@ -37,18 +36,25 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.processes import rank_and_world_size
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
+    from lidargrit.inference.drives import path_of, write_drives
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
     from lidargrit.nn.devices import usable_device
 
     seeds = seeds_in_a_row(options.seed, options.count)
     address, words = ray_address(options), sampling_words(options.set)
+    if address and options.frames:
+        raise ConfigError("--frames with --ray", "one of them", "leave --ray out")
     if address:
         write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
         rank, world_size = rank_and_world_size(options.rank, options.world_size)
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
         device, run_folder = usable_device(options.device or own), locate(options.run_folder)
-        generator = load(run_folder).to(device)
-        seeds = seeds[rank::world_size]
-        write_samples(generator, run_folder, options.out, seeds, generator.parse_sampling(words))
-    print(f"done: {counted_scans(len(seeds))} in {options.out}; {look_at(options.out)}")
+        generator, seeds = load(run_folder).to(device), seeds[rank::world_size]
+        sampling = generator.parse_sampling(words)
+        if options.frames:
+            ways = [path_of(options.frames, options.path)] * len(seeds)
+            write_drives(generator, run_folder, options.out, ways, seeds, sampling, path=str(options.path))
+        else:
+            write_samples(generator, run_folder, options.out, seeds, sampling)
+    print(f"done: {counted_scans(len(seeds) * max(1, options.frames))} in {options.out}; {look_at(options.out)}")

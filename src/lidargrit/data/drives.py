@@ -178,28 +178,42 @@ def _last_scan(out: Path, config: DriveConfig) -> int:
 
 
 def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:
-    """Write what a sequence has once: poses in KITTI's form, times and calibration."""
+    """Write what a sequence has once: poses, and times of a drive."""
     poses: dict[str, list[Float64[np.ndarray, "4 4"]]] = {}
     for first in range(0, num_scans, config.frames):
         scans = range(first, min(first + config.frames, num_scans))
-        relative = [np.eye(4)]
+        moved = [np.eye(4)]
         if config.frames > 1:
             times_s = [FRAME_S * (scan - first) for scan in scans]
             way = poses_of(config.street_of(first)[0], times_s, config.sensor, config.theme)
             moved = [np.linalg.inv(way[0]) @ pose for pose in way]
-            relative = [_CAMERA_FROM_SENSOR @ each @ np.linalg.inv(_CAMERA_FROM_SENSOR) for each in moved]
-        for scan, pose in zip(scans, relative, strict=True):
+        for scan, pose in zip(scans, moved, strict=True):
             poses.setdefault(config.sequence_and_number(scan)[0], []).append(pose)
+    for sequence, moved in poses.items():
+        write_motions(out, sequence, moved, FRAME_S if config.frames > 1 else None)
+
+
+def write_motions(
+    out: Path, sequence: str, poses: Sequence[Float64[np.ndarray, "4 4"]], period_s: float | None
+) -> None:
+    """Write the poses of a sequence in KITTI's form, the calibration they need, and times.
+
+    Args:
+        out: folder of the tree.
+        sequence: name of the sequence.
+        poses: matrix of each scan from the sensor's frame to that at the first scan.
+        period_s: time from scan to scan, in seconds; None for scans that are no drive, which have no times.
+    """
+    relative = [_CAMERA_FROM_SENSOR @ pose @ np.linalg.inv(_CAMERA_FROM_SENSOR) for pose in poses]
     projection = _numbers(np.eye(3, 4))
     calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
-    for sequence, relative in poses.items():
-        folder = out / "sequences" / sequence
-        lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
-        write_text(out / "poses" / f"{sequence}.txt", lines)
-        write_text(folder / "poses.txt", lines)
-        if config.frames > 1:
-            write_text(folder / "times.txt", "".join(f"{number * FRAME_S:e}\n" for number in range(len(relative))))
-        write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
+    folder = out / "sequences" / sequence
+    lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
+    write_text(out / "poses" / f"{sequence}.txt", lines)
+    write_text(folder / "poses.txt", lines)
+    if period_s is not None:
+        write_text(folder / "times.txt", "".join(f"{number * period_s:e}\n" for number in range(len(relative))))
+    write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
 
 
 def _numbers(matrix: Float64[np.ndarray, "3 4"]) -> str:

@@ -7,7 +7,7 @@ import torch
 from lidargrit.core.errors import DataError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.windows import drives_in
-from lidargrit.scans.motion import transform_between
+from lidargrit.scans.motion import Motion, transform_between
 from lidargrit.scans.past import Past
 
 _NEXT = 0.7  # share of pasts in training that end one scan before the present one
@@ -34,6 +34,10 @@ class Pasts:
             got = "scans of which none follows another in a drive, with time and pose"
             cure = "simulate some with: lidargrit simulate DRIVES --frames 12 -n 1200"
             raise DataError(got, "drives: scans in a row with times and poses", cure)
+
+    def motion(self, index: int) -> Motion:
+        """Return when and where an image was made."""
+        return self._scans[index].motion
 
     def random_gap(self, index: int, rng: torch.Generator) -> int:
         """Return how many steps before an image its past may end in training: mostly 1, else up to 10.

@@ -11,7 +11,7 @@ from lidargrit.core import configuration
 from lidargrit.core.errors import CheckpointError, ConfigError, LidarGritError, UnknownNameError, nearest_names, one_of
 from lidargrit.core.files import is_taken, read_json, sha256_of, write_text
 from lidargrit.data.images import Provenance
-from lidargrit.scans.projection import ProjectionVariant
+from lidargrit.scans.projection import ProjectionVariant, variant_named
 from lidargrit.scans.sensors import SensorModel
 
 CONFIG_FILE, WEIGHTS_FILE, CARD_FILE = "config.json", "model.safetensors", "README.md"  # the names that the hub knows
@@ -149,7 +149,7 @@ def recorded_projection(folder: Path) -> str:
 
 def projection_variant(folder: Path) -> ProjectionVariant:
     """Return the variant by which scans become images for the model of a run; "exact" if it is not known."""
-    return "reference" if recorded_projection(folder) == "reference" else "exact"
+    return variant_named(recorded_projection(folder))
 
 
 def trained_on(folder: Path) -> Provenance:

@@ -286,9 +286,10 @@ class _Remaining:
 
 
 def as_table(scores: Sequence[Path], form: Format = "text", remarks: Sequence[str] = ()) -> str:
-    """Return the scores side by side, below them what each system costs, and remarks."""
+    """Return the scores side by side, below them what each system costs, if that is known of one, and remarks."""
     costs = costs_table([(path.stem, path.parent / COSTS) for path in scores], remarks)
-    return render([*side_by_side(scores), costs], form)
+    known = remarks or any(any(numbers) for _, *numbers in costs.rows)
+    return render([*side_by_side(scores), *([costs] if known else [])], form)
 
 
 def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:

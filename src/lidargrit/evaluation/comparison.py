@@ -185,7 +185,7 @@ def compare_sources(
     settings = settings or EvalConfig()
     if not (samples and reference):
         got = f"{samples!r} alone" if samples else "nothing to score"
-        raise ConfigError(got, "samples and what they are compared with", "name two sets, or use --tables")
+        raise ConfigError(got, "samples and what they are compared with", "name two sets")
     usable_device(settings.device)
     first = open_source(samples, settings.data.bad_points, settings.samples_format)
     second = open_reference(reference, settings)

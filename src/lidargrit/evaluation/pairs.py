@@ -133,6 +133,7 @@ def pair_for_protocol(
         sensor: sensor that scans are imaged with, in place of the protocol's; samples that are images keep theirs.
     """
     sensor = sensor or protocol.load_sensor()
+    samples = samples.cut(protocol.first_points) if protocol.first_points else samples
     config = replace(config, max_scans=protocol.scans_at_most(config.max_scans))
     first = Opened.of(samples, sensor, config)
     if samples.has_points:  # whose points may have had to go by elevation: then so do the reference's

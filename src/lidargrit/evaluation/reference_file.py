@@ -126,6 +126,7 @@ class ReferenceFile:
             got = f"-n {at_most} with {self.path}, which sums up {counted_scans(count)}"
             raise ConfigError(got, wanted, cure)
         config = replace(config, max_scans=at_most, projection_variant=kept.projection_variant or "exact")
+        samples = samples.cut(protocol.first_points) if protocol.first_points else samples
         first = Opened.of(samples, self.sensor, config)
         if len(first.images) < count:
             got = f"{counted_scans(len(first.images))} in {samples.text}, and a reference file of {count:,}"

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit.core.errors import DataError
-from lidargrit.core.files import read_json, write_json
-from lidargrit.core.table import Format, Table, render
+from lidargrit.core.files import write_json
+from lidargrit.core.table import Table
 from lidargrit.evaluation.intervals import Estimate, Resampling, Score, blocks, format_value, spread_of
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
 from lidargrit.evaluation.verdict import (
@@ -84,13 +84,6 @@ def share_pixel_statistics(paths: Sequence[Path]) -> None:
         for (name, card), (_, before) in zip(_with_pixel_statistics(cards), cards, strict=True):
             if card != before:
                 write_json(Path(f"{name}.json"), card.to_json())
-
-
-def read_tables(paths: Sequence[Path], form: Format = "text") -> tuple[str, dict[str, Any]]:
-    """Return the scores of several files side by side, and the content of each file by its name."""
-    return render(side_by_side(paths), form), {
-        name: read_json(path) for path, name in zip(paths, _names(paths), strict=True)
-    }
 
 
 def _names(paths: Sequence[Path]) -> list[str]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import SEED_AT_MOST
-from lidargrit.scans.condition import KINDS, ConditionKind, Observed
+from lidargrit.scans.condition import KINDS, Condition, ConditionKind, Nothing, Observed
+from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -89,12 +90,38 @@ def check_images(images: RangeImage | Observed, sensor: SensorModel) -> None:
         )
 
 
-def check_observed(condition: Observed, kinds: Collection[ConditionKind], sensor: SensorModel, name: str) -> None:
-    """Refuse observations of other rays, and those of a kind that a generator does not take."""
-    check_images(condition, sensor)
-    if not condition.kinds <= set(kinds):
-        raise ConfigError(
-            " and ".join(KINDS[kind] for kind in sorted(condition.kinds - set(kinds))),
-            " or ".join(KINDS[kind] for kind in sorted(kinds)) + f", which is what this {name!r} takes",
-            "choose a model of lidargrit, such as pretrained",
-        )
+def check_condition(
+    condition: Condition,
+    takes: Collection[type[Condition]],
+    kinds: Collection[ConditionKind],
+    sensor: SensorModel,
+    name: str,
+    first_command: str,
+    count: int | None = None,
+) -> None:
+    """Refuse a condition of a type that a generator does not take, or by other rays, and observations of other kinds.
+
+    Args:
+        kinds: kinds of observations that it takes.
+        first_command: command of ``lidargrit`` by which a generator that takes others is used.
+        count: number of images that it is of; None where none are given.
+    """
+    if isinstance(condition, Observed):
+        check_images(condition, sensor)
+        if not condition.kinds <= set(kinds):
+            raise ConfigError(
+                " and ".join(KINDS[kind] for kind in sorted(condition.kinds - set(kinds))),
+                " or ".join(KINDS[kind] for kind in sorted(kinds)) + f", which is what this {name!r} takes",
+                "choose a model of lidargrit, such as pretrained",
+            )
+    if type(condition) not in takes:
+        kind, wanted = type(condition).__name__, ", ".join(sorted(one.__name__ for one in takes))
+        got = "no condition" if isinstance(condition, Nothing) else f"a condition of type {kind}"
+        wanted = f"one of type {wanted}" if wanted else "a generator that samples"
+        raise ConfigError(f"{got} for {name!r}", wanted, f"use it with: lidargrit {first_command}")
+    if isinstance(condition, Past) and not condition.sensor.same_rays(sensor):
+        got = f"a past by the sensor {condition.sensor.name!r}, {condition.sensor.height}x{condition.sensor.width}"
+        raise ConfigError(got, f"one on the generator's own rays, {sensor.height}x{sensor.width}", "project its scans")
+    if count not in (None, len(condition)):
+        got = f"a {type(condition).__name__} of {len(condition)} scans for {count} images"
+        raise ConfigError(got, "one for each image", "take as many of both")

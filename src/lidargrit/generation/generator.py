@@ -14,7 +14,7 @@ from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import Job, is_bundle, locate, named_folder
-from lidargrit.generation.batches import BatchSeeds, check_images, check_observed, check_seeds, in_batches, one_by_one
+from lidargrit.generation.batches import BatchSeeds, check_condition, check_images, check_seeds, in_batches, one_by_one
 from lidargrit.generation.facts import CAPABILITIES, Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.hub import located
 from lidargrit.generation.objective import Objective
@@ -161,12 +161,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             seeds: seeds, one for each scan, from 0 to 2^32 - 1.
             condition: condition of a type in :attr:`takes`, of as many scans as seeds;
                 ``Observed.of_pixels(images, observed)`` completes scans.
-            sampling: settings of the generator's own ``Sampling``; its defaults if not given, and
-                :meth:`completion_sampling` for what was observed.
+            sampling: settings of its own ``Sampling``; its defaults, or :meth:`completion_sampling`, if not given.
 
         Raises:
-            ConfigError: seeds that are none, too many, too few or out of bounds, settings of another generator, images
-                of other rays, or a condition that the generator does not take.
+            ConfigError: wrong seeds or another number of them, or settings, rays or a condition of another generator.
 
         Example::
 
@@ -179,9 +177,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         if isinstance(known, Observed):
             return self._completed(known, seeds, sampling)
         settings = self._settings(sampling, self.Sampling)
-        return known.put_into(
-            in_batches(seeds, self.batch_size(settings), lambda at, some: self._sample(some, known[at], settings))
-        )
+        made = in_batches(seeds, self.batch_size(settings), lambda at, some: self._sample(some, known[at], settings))
+        return known.put_into(made)
 
     @final
     def complete(self, condition: Observed, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
@@ -231,9 +228,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
             images: batch of range images (B, H, W).
             seeds: seeds, one for each image, from 0 to 2^32 - 1; the search starts at random.
             sampling: settings of the generator's own ``Sampling``; its defaults if not given.
-
-        Raises:
-            ConfigError: see :meth:`sample`.
         """
         self._require("invert")
         check_images(images, self.sensor)
@@ -244,28 +238,34 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @inference()
-    def bits(self, images: RangeImage, step_mm: int = 10, expected: bool = False) -> ScanBits:
+    def bits(
+        self, images: RangeImage, step_mm: int = 10, expected: bool = False, condition: Condition = NOTHING
+    ) -> ScanBits:
         """Return the negative log-likelihood of each scan in bits, each computed by itself (capability ``likelihood``).
 
         It is exact for generators without tokens. With tokens it is an upper bound, since tokens other than the
-        encoder's could stand for the same scan.
-        Ranges are rounded to a step, since a real number would need infinitely many bits. Systems can be compared
-        by their bits at one step if these are of the whole scan (:attr:`ScanBits.is_whole`).
+        encoder's could stand for the same scan. Systems can be compared by the bits of whole scans
+        (:attr:`ScanBits.is_whole`) at one step.
 
         Args:
             images: batch of range images (B, H, W).
-            step_mm: step of the ranges in whole millimetres.
+            step_mm: step in whole millimetres that ranges are rounded to, as a real number has infinitely many bits.
             expected: whether the expected number of bits (the entropy) is computed, too, for :meth:`ScanBits.surprise`.
+            condition: condition of each scan, such as its past, for a generator whose likelihood depends on it.
 
         Raises:
-            ConfigError: images of other rays, another step, or a generator without the capability.
+            ConfigError: images of other rays, another step or condition, or a generator without the capability.
         """
         self._require("likelihood")
         check_images(images, self.sensor)
         steps = RangeSteps(self.sensor, step_mm)
         self.eval()
-        rounded = steps.round(images.to(self.device))
-        return ScanBits.cat([self._bits(image, steps, expected) for image in one_by_one(rounded)])
+        rounded = one_by_one(steps.round(images.to(self.device)))
+        if isinstance(condition, Nothing):
+            return ScanBits.cat([self._bits(image, steps, expected) for image in rounded])
+        self._check_condition(condition, len(images))
+        each = zip(rounded, (condition.to(self.device)[[at]] for at in range(len(images))), strict=True)
+        return ScanBits.cat([self._bits_given(image, known, steps, expected) for image, known in each])
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: SamplingT) -> RangeImage:
         """Generate one scan for each seed of a batch; scans of copies at their end may be left out.
@@ -287,16 +287,15 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         raise NotImplementedError
 
-    def _check_condition(self, condition: Condition) -> None:
+    def _bits_given(self, images: RangeImage, condition: Condition, steps: RangeSteps, expected: bool) -> ScanBits:
+        """Return the bits under a condition; a generator whose likelihood depends on one overrides it."""
+        raise ConfigError(f"a condition for the likelihood of {self.public_name()!r}", "scans alone", "leave it out")
+
+    def _check_condition(self, condition: Condition, count: int | None = None) -> None:
         if isinstance(condition, Observed):
             self._require("complete")
-            check_observed(condition, self.conditions, self.sensor, self.public_name())
-        if type(condition) not in self.takes:
-            kind, wanted = type(condition).__name__, ", ".join(sorted(one.__name__ for one in self.takes))
-            got = "no condition" if isinstance(condition, Nothing) else f"a condition of type {kind}"
-            cure = f"use it with: lidargrit {self.facts.first_command}"
-            wanted = f"one of type {wanted}" if wanted else "a generator that samples"
-            raise ConfigError(f"{got} for {self.public_name()!r}", wanted, cure)
+        named, command = self.public_name(), self.facts.first_command
+        check_condition(condition, self.takes, self.conditions, self.sensor, named, command, count)
 
     def _completed(self, known: Observed, seeds: Sequence[int], sampling: SamplingT | None) -> RangeImage:
         """Complete each scan, by the bundle's run for what was observed of it if there is one."""

@@ -24,6 +24,7 @@ KITTI_360 = DataConfig(
     ("kitti_360:data/kitti_360:train_without_val",), ("kitti_360:data/kitti_360:val",), "hdl64e_kitti_360"
 )
 KITTI_ODOMETRY = DataConfig(("kitti_odometry:data/kitti_odometry:train",), ("kitti_odometry:data/kitti_odometry:val",))
+NUSCENES = DataConfig(("nuscenes:data/nuscenes:train",), ("nuscenes:data/nuscenes:val",), "hdl32e", columns=1024)
 
 KITTI_360_EPOCH = 50_000
 """Number of scans of the training drives, roughly."""
@@ -167,7 +168,7 @@ def load_preset(name: str, settings: Sequence[str] = ()) -> Preset:
         raise ConfigError(
             f"{name}, a folder that holds no finished run",
             "a preset, or where systems are compared a finished run or samples",
-            "see lidargrit list presets; score scans with lidargrit evaluate (--tables: side by side)",
+            "see lidargrit list presets; score scans with lidargrit evaluate",
         )
     is_generator = is_preset(name) and name not in discovery.names("presets")
     found = default_preset(name) if is_generator else discovery.load_instance("presets", name, Preset)

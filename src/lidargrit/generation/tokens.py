@@ -29,7 +29,7 @@ from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.fills import fill_from_nearest
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import RangeImage, TokenGrid
+from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 
 _DECODED_AT_ONCE = 4  # scans on a CPU, where more would only take memory: 35 MB a layer at 64x1024
 
@@ -290,14 +290,7 @@ class PixelObjective(Objective):
 
         In training some phases of each scan stand for all; in validation all are counted.
         """
-        images = example.images
-        decoded = None
-        if self._tokens is not None and self._decoding is not None:
-            tokenizer = self._decoding.network(images.range_m.device)
-            with torch.no_grad(), in_full(images.range_m.device):  # as when scans are sampled
-                decoded = tokenizer.decode(
-                    TokenGrid.unchecked(self._tokens(images, example.keys).long(), tokenizer.num_codes)
-                )
+        images, decoded = example.images, self.decoded(example, rng)
         if self.training:
             mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
         else:
@@ -305,6 +298,16 @@ class PixelObjective(Objective):
             mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
         bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
         return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}
+
+    def decoded(self, example: Example, rng: torch.Generator) -> Decoded | None:
+        """Return what the pixel decoder is given of each scan besides its own pixels; None for nothing."""
+        if self._tokens is None or self._decoding is None:
+            return None
+        device = example.images.range_m.device
+        tokenizer = self._decoding.network(device)
+        with torch.no_grad(), in_full(device):  # as when scans are sampled
+            tokens = self._tokens(example.images, example.keys).long()
+            return tokenizer.decode(TokenGrid.unchecked(tokens, tokenizer.num_codes))
 
 
 def _tokens(tokenizer: Tokenizer, images: RangeImage) -> Int[Tensor, "B h w"]:

@@ -344,7 +344,8 @@ class Decoded:
     """Output of a decoder for every pixel of a batch of scans, before returns are sampled.
 
     Args:
-        range_m: range of the surface that the beam meets, in metres, whether or not it returns.
+        range_m: range of the surface that the beam meets, in metres, whether or not it returns; 0 where a decoder of
+            some pixels only tells none.
         return_logits: logits of the probability that the beam returns.
         sensor: sensor whose rays the pixels are.
         reflectance: reflectance of that surface, in [0, 1]; None from a decoder without reflectance.

@@ -19,6 +19,7 @@ from lidargrit.scans.sensors import SensorModel, continuous_azimuths_rad
 
 _BESIDE = 2  # fine columns to the neighbours of a plane: nearer ones are less far apart than ranges are wrong
 _SAME_SURFACE = 0.15  # of a range: neighbours that differ by more are of another surface
+_ON_SURFACE_M, _ON_SURFACE = 0.05, 0.02  # metres, and share of the range, by which returns on one surface differ
 _COS_AT_LEAST = 0.03  # of incidence: flatter planes are not followed
 _CORRECTION_AT_MOST = 0.1  # of a range
 _LONE_ROW_RAD = math.radians(1)  # height of the row of a sensor with only one
@@ -47,6 +48,20 @@ class WarpedReturns(NamedTuple):
         return self.range_m > 0
 
 
+class WarpedSurface(NamedTuple):
+    """The mean of the returns on each ray that lie on the surface of the nearest; all are 0 where there is none.
+
+    Args:
+        range_m: mean range along the ray, in metres.
+        spread_m: mean distance of the returns from their mean, in metres.
+        returns: number of the returns.
+    """
+
+    range_m: Float64[Tensor, "B H W"]
+    spread_m: Float64[Tensor, "B H W"]
+    returns: Int64[Tensor, "B H W"]
+
+
 @dataclass(frozen=True, eq=False)
 class WarpedPast:
     """What the past tells of each ray of the present image.
@@ -56,6 +71,8 @@ class WarpedPast:
         last: nearest return of the latest scan within one fine column of the ray.
         nearest: nearest return of all scans within half a fine column.
         aligned: return of all scans within one fine column that is nearest to the ray in angle.
+        surface: mean of the returns within one fine column about the nearest one; where none is within half a column,
+            about the aligned one.
         scans: number of scans with a return within half a fine column.
     """
 
@@ -63,6 +80,7 @@ class WarpedPast:
     last: WarpedReturns
     nearest: WarpedReturns
     aligned: WarpedReturns
+    surface: WarpedSurface
     scans: Int64[Tensor, "B H W"]
 
 
@@ -76,7 +94,7 @@ def warp(past: Past) -> WarpedPast:
     rays = _rays_of(past.sensor, past.range_m.device)
     size = past.sensor.height, past.sensor.width
     last, nearest, aligned = list[WarpedReturns](), list[WarpedReturns](), list[WarpedReturns]()
-    scans = list[Tensor]()
+    surface, scans = list[WarpedSurface](), list[Tensor]()
     for images_m, transforms, ages_s in zip(past.range_m, past.transforms, past.ages_s, strict=True):
         latest_first = [*zip(images_m, transforms, ages_s, strict=True)][::-1]
         each = [_on_rays(image_m, matrix, age_s, rays) for image_m, matrix, age_s in latest_first]
@@ -84,9 +102,13 @@ def warp(past: Past) -> WarpedPast:
         last.append(each[0].least(each[0].range_m, size))
         nearest.append(every.least(torch.where(every.is_close, every.range_m, torch.inf), size))
         aligned.append(every.least(every.offset_rad, size))
+        about_m = torch.where(nearest[-1].mask, nearest[-1].range_m, aligned[-1].range_m)
+        surface.append(every.surface(about_m))
         scans.append(torch.stack([one.close_pixels(size) for one in each]).sum(0))
     copied_m = past.range_m[:, -1, :, :: past.sensor.column_stride].double()
-    return WarpedPast(copied_m, _stacked(last), _stacked(nearest), _stacked(aligned), torch.stack(scans))
+    layers = _stacked(last), _stacked(nearest), _stacked(aligned)
+    means = WarpedSurface(*map(torch.stack, zip(*surface, strict=True)))
+    return WarpedPast(copied_m, *layers, means, torch.stack(scans))
 
 
 def _stacked(of_scans: list[WarpedReturns]) -> WarpedReturns:
@@ -170,6 +192,26 @@ class _OnRays(NamedTuple):
         first = number.new_full(least.shape, none).scatter_reduce(0, self.pixel, number, "amin").view(size)
         parts = (self.range_m, self.age_s, self.cos_incidence, self.offset_rad)
         return WarpedReturns(*(torch.cat((part, part.new_zeros(1)))[first] for part in parts))
+
+    def surface(self, about_m: Float64[Tensor, "H W"]) -> WarpedSurface:
+        """Return the mean of the returns on each ray that are on one surface with a range."""
+        own_m = about_m.flatten()[self.pixel]
+        on_it = (self.range_m - own_m).abs() <= _ON_SURFACE_M + _ON_SURFACE * own_m
+        order = self.pixel[on_it].argsort(stable=True)
+        pixel, range_m = self.pixel[on_it][order], self.range_m[on_it][order]
+        rank = torch.arange(len(pixel), device=pixel.device) - torch.searchsorted(pixel, pixel)
+        rounds = [rank == number for number in range(int(rank.max()) + 1 if len(rank) else 0)]
+        returns = torch.bincount(pixel, minlength=about_m.numel())
+
+        def mean_of(values: Float64[Tensor, "n"]) -> Float64[Tensor, "p"]:
+            total = values.new_zeros(about_m.numel())
+            for now in rounds:  # one return of each ray at a time, so that sums have a fixed order
+                total[pixel[now]] += values[now]
+            return total / returns.clamp(min=1)
+
+        mean_m = mean_of(range_m)
+        spread_m = mean_of((range_m - mean_m[pixel]).abs())
+        return WarpedSurface(*(part.view(about_m.shape) for part in (mean_m, spread_m, returns)))
 
     def close_pixels(self, size: tuple[int, int]) -> Int64[Tensor, "H W"]:
         """Return 1 on each ray with a return within half a fine column."""

@@ -3,8 +3,12 @@
 from pathlib import Path
 from typing import ClassVar
 
+import torch
+
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
+from lidargrit.data.formats.argoverse_feather import sensor_poses
+from lidargrit.scans.motion import Motion
 
 
 class Argoverse2(FileDataset):
@@ -38,6 +42,14 @@ class Argoverse2(FileDataset):
         "train/00000000-0000-3000-8000-000000000000/sensors/lidar/{index:018d}.feather",
         "val/00000000-0000-3000-8000-000000000001/sensors/lidar/{index:018d}.feather",
     )
+
+    def motion(self, index: int) -> Motion:
+        """Return time and pose of a scan, by its file's name and ``city_SE3_egovehicle.feather`` of its log."""
+        path = self.path(index)
+        if not path.stem.isdecimal():
+            return Motion()
+        pose = sensor_poses(path).get(int(path.stem))
+        return Motion(int(path.stem) / 1e9, None if pose is None else torch.from_numpy(pose))
 
     def sequence_of(self, relative: Path) -> str:
         """Name the split and the log of a file."""

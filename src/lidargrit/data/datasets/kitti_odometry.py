@@ -10,11 +10,9 @@ import torch
 from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
-from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.data.formats import read_bytes
 from lidargrit.scans.classes import notes_on_labels
 from lidargrit.scans.columns import usable_points
-from lidargrit.scans.motion import Motion
 from lidargrit.scans.types import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
@@ -68,10 +66,11 @@ class KittiOdometry(FileDataset):
 
     @classmethod
     def origin_of(cls, root: Path) -> str:
-        """Return ``simulated`` for a tree of ``simulate``, "" for one of ``export``, and else see the base."""
+        """Return ``simulated`` for a tree of ``simulate``, "" for one of other verbs, and else see the base."""
         if (root / "simulated.json").is_file():
             return "simulated"
-        return "" if (root / "export.json").is_file() else super().origin_of(root)
+        ours = any((root / name).is_file() for name in ("export.json", "drive.json"))
+        return "" if ours else super().origin_of(root)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
@@ -92,12 +91,6 @@ class KittiOdometry(FileDataset):
             points = torch.from_numpy(rows)
             label = label[usable_points(points[:, :3], points[:, 3])]
         return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))
-
-    def motion(self, index: int) -> Motion:
-        """Return time and pose of a scan by ``times.txt``, ``poses.txt`` and ``calib.txt`` of its sequence."""
-        path = self.path(index)
-        known, number = motions(path.parents[1]), path.stem
-        return known[int(number)] if number.isdecimal() and int(number) < len(known) else Motion()
 
     def companions(self, index: int) -> tuple[Path, ...]:
         """Return the file of a scan's labels."""

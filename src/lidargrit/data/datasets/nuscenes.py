@@ -1,9 +1,18 @@
 """nuScenes: ROOT/{samples,sweeps}/LIDAR_TOP/*.pcd.bin → scans of 1000 scenes of 20 s, in the order of time."""
 
+import json
+import re
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from lidargrit.core.errors import DataError, LidarGritError
 from lidargrit.core.files import read_json
@@ -12,8 +21,11 @@ from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints
+from lidargrit.scans.motion import Motion
 
 _TABLE_BYTES_AT_MOST = 50_000_000  # sample.json, the largest, has 9 MB
+_ROW = re.compile(rb"\{[^{}]{1,4096}\}")
+_FILE_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # x right, y forward
 _BESIDE_US = 600_000  # sweeps before a scene's first sample or after its last one, which lie half a second apart
 _LAST_SCENE = 1110
 _VAL = (
@@ -94,6 +106,13 @@ class Nuscenes(FileDataset):
         near = [scene for scene in scenes[max(last - 1, 0) : last + 1] if time_us <= scene[1] + _BESIDE_US]
         return min(near, key=lambda scene: max(scene[0] - time_us, time_us - scene[1], 0))[2] if near else log
 
+    def motion(self, index: int) -> Motion:
+        """Return time and pose of a scan, by its file's name and the tables of the car's and the sensor's poses."""
+        path = self.path(index)
+        _, time_us = _log_and_time(path)
+        pose = _poses(self.root).get(path.name)
+        return Motion(time_us / 1e6 if time_us else None, None if pose is None else torch.from_numpy(pose))
+
     def recording_of(self, path: Path) -> str:
         """Name the log of a file: scenes are cut from it."""
         log, _ = _log_and_time(path)
@@ -144,3 +163,42 @@ def _read_scenes(root: Path) -> dict[str, list[tuple[int, int, str]]]:
 
 def _read_table(path: Path) -> list[dict[str, Any]]:
     return read_json(path, list, DataError, "a table of nuScenes", "unpack it again", _TABLE_BYTES_AT_MOST)
+
+
+@lru_cache(maxsize=4)
+def _poses(root: Path) -> dict[str, Float64[np.ndarray, "4 4"]]:
+    """Return the pose of LIDAR_TOP at each scan by its file's name; none without the tables.
+
+    Those of the whole data set have 2 GB: they are read row by row, and rows of cameras and radars left out.
+    """
+    found = dict[str, Float64[np.ndarray, "4 4"]]()
+    for table in sorted(root.glob("v1.0-*/sample_data.json")):
+        try:
+            scans = [row for row in _rows(table) if "/LIDAR_TOP/" in row["filename"]]
+            wanted = {row[name] for row in scans for name in ("ego_pose_token", "calibrated_sensor_token")}
+            poses = {
+                row["token"]: _matrix(row)
+                for name in ("ego_pose.json", "calibrated_sensor.json")
+                for row in _rows(table.with_name(name))
+                if row["token"] in wanted
+            }
+            for row in scans:
+                pose = poses[row["ego_pose_token"]] @ poses[row["calibrated_sensor_token"]] @ _FILE_FROM_SENSOR
+                found[Path(row["filename"]).name] = pose
+        except (KeyError, TypeError, ValueError, OSError) as error:
+            got = f"{table.parent}, whose poses cannot be used ({str(error)[:100]})"
+            raise DataError(got, "sample_data, ego_pose and calibrated_sensor", "unpack the metadata again") from None
+    return found
+
+
+def _rows(table: Path) -> Iterator[dict[str, Any]]:
+    with table.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        for row in _ROW.finditer(content):
+            yield json.loads(row[0])
+
+
+def _matrix(row: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
+    w, x, y, z = row["rotation"]
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat((x, y, z, w)).as_matrix(), row["translation"]
+    return matrix

@@ -1,6 +1,7 @@
 """Argoverse 2 .feather: the points of two VLP-32C ⇄ :class:`Scan` of one of them, with a ring per point."""
 
 import struct
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -169,6 +170,27 @@ def _pose(path: Path, name: str) -> tuple[Float64[np.ndarray, "3 3"], Float64[np
     if not level:
         raise ScanError(f"no pose of {name} on a car in {calibration}", f"{wanted}, with a unit quaternion", _CURE)
     return _axes_and_origin(pose)
+
+
+def sensor_poses(path: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
+    """Return the poses of the upright sensor in the city by the times of sweeps in nanoseconds; none without the file.
+
+    Args:
+        path: sweep of the log.
+    """
+    poses = path.absolute().parents[2] / "city_SE3_egovehicle.feather"
+    return _sensor_poses(poses, path.absolute().parent) if poses.is_file() else {}
+
+
+@lru_cache(maxsize=64)
+def _sensor_poses(poses: Path, sweeps: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
+    data = read_bytes(poses, _FILE_BYTES_AT_MOST, "poses of the car")
+    columns = _columns(poses, ("timestamp_ns", *_POSE_COLUMNS), data)
+    numbers = np.stack([columns[name] for name in _POSE_COLUMNS], axis=1).astype(np.float64)
+    car_from_sensor, found = np.eye(4), np.tile(np.eye(4), (len(numbers), 1, 1))
+    car_from_sensor[:3, :3], car_from_sensor[:3, 3] = _pose(sweeps / "any.feather", _NAMES[0])
+    found[:, :3, :3], found[:, :3, 3] = Rotation.from_quat(numbers[:, :4]).as_matrix(), numbers[:, 4:]
+    return dict(zip(columns["timestamp_ns"].tolist(), found @ car_from_sensor, strict=True))
 
 
 def _axes_and_origin(pose: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:

@@ -23,7 +23,8 @@ class DataConfig(Settings):
         columns: number of fine columns over the whole circle; 0 for the sensor's own number.
         column_stride: step between the fine columns that an image keeps, such as 8 for every eighth.
         projection: ``spherical`` (rows by elevation), ``unfolding`` (rows by ring), or ``sensor`` for the sensor's own.
-        projection_variant: ``exact``, or ``reference`` to repeat the projection of LidarGRIT's released program.
+        projection_variant: ``exact``; ``reference`` repeats the projection of LidarGRIT's program, ``clamped`` that of
+            R2DM's, LiDARGen's and LiDARCrafter's.
         condition: name of what a generator is told of each training scan, from: lidargrit list conditions.
         max_scans: largest number of scans taken from each source, evenly spaced over it; 0 for all.
         bad_points: ``refuse`` a scan with points that are NaN, infinite or at the origin, or ``drop`` these points.

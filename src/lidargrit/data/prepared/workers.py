@@ -28,7 +28,7 @@ from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.arrays import ImageArrays, facts_of, stored
 from lidargrit.data.prepared.plan import ARRAYS, PLANES, MadeScans, PreparedSpec, made_name, pixels_name
 from lidargrit.data.prepared.prepared import PreparedFolder
-from lidargrit.scans.projection import project
+from lidargrit.scans.projection import project, variant_named
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -114,7 +114,7 @@ def make_shard(
     for index in sorted(set(spec.scans_of(shard)) - writer.scans):
         try:
             scan = dataset.scan(wanted[index])
-            image = project(scan, sensor, variant="reference" if spec.variant == "reference" else "exact")
+            image = project(scan, sensor, variant=variant_named(spec.variant))
         except ScanError as error:
             if spec.bad_scans == "refuse":
                 leave_out = "leave such scans out by --bad-scans skip"

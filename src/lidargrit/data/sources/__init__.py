@@ -16,6 +16,7 @@ from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages, is_prepared
 from lidargrit.data.run_folder import is_run, is_unfinished, locate, read_config, recorded_projection
 from lidargrit.data.sources.image_files import ImageFileSource, image_files
+from lidargrit.data.sources.memory import CutSource
 from lidargrit.data.sources.sample_formats import (
     is_tensor_folder,
     load_sample_format,
@@ -72,6 +73,10 @@ class DatasetSource(Source):
     def scans(self) -> ScanDataset:
         """Return the data set, as it was opened."""
         return self._dataset
+
+    def cut(self, num_points: int) -> Source:
+        """Return the source with the first points of each scan alone, which no cache keeps."""
+        return CutSource(self, num_points)
 
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans once, and find them in the cache from then on."""

@@ -1,9 +1,12 @@
-"""Scans in memory → range images, as a source beside those that are named."""
+"""Scans in memory, or the first points of each scan of a data set → range images, as a source beside those named."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import torch
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import DataError
+from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.source import Source
@@ -28,13 +31,68 @@ class MemorySource(Source):
         """Sensor that made the scans."""
         return self._sensor
 
+    def cut(self, num_points: int) -> Source:
+        """Return the source with the first points of each scan alone."""
+        found = MemorySource([_first_points(scan, num_points) for scan in self._scans], self._sensor)
+        found.doubts = (_told(self, num_points),)
+        return found
+
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans, or so many of them, evenly spaced."""
-        sensor, config = sensor or self.sensor, config or DataConfig()
-        chosen = evenly_spaced(config.max_scans or len(self._scans), len(self._scans))
-        self.projection_variant = by = config.projection_variant
-        images = [project_by_what_fits(self._scans[index], sensor, by)[0] for index in chosen]
-        return RangeImages(sensor, [_Images(images)])
+        config = config or DataConfig()
+        self.projection_variant = config.projection_variant
+        return _imaged(self._scans.__getitem__, len(self._scans), sensor or self.sensor, config)
+
+
+class CutSource(Source):
+    """The scans of a data set, each without what lies behind the first points of its file.
+
+    Args:
+        source: source of the scans.
+        num_points: largest number of points of a scan.
+    """
+
+    kind, has_points = "scans", True
+
+    def __init__(self, source: Source, num_points: int) -> None:
+        super().__init__(source.text)
+        self.data_set, self.split = source.data_set, source.split
+        self._source, self._num_points = source, num_points
+        self.doubts = (_told(source, num_points),)
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor that made the scans."""
+        return self._source.sensor
+
+    def scans(self) -> ScanDataset:
+        """Return the scans with all their points."""
+        return self._source.scans()
+
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+        """Project the first points of the scans, or of so many of them, evenly spaced."""
+        scans, config = self.scans(), config or DataConfig()
+        self.projection_variant = config.projection_variant
+        return _imaged(
+            lambda index: _first_points(scans.scan(index), self._num_points),
+            len(scans),
+            sensor or config.imaged(self.sensor),
+            config,
+        )
+
+
+def _told(source: Source, num_points: int) -> str:
+    return f"of each cloud of {source.text} the first {num_points:,} points alone are scored, as by that program"
+
+
+def _first_points(scan: Scan, num_points: int) -> Scan:
+    return scan.select(torch.arange(min(num_points, len(scan))))
+
+
+def _imaged(scan: Callable[[int], Scan], count: int, sensor: SensorModel, config: DataConfig) -> RangeImages:
+    chosen = evenly_spaced(config.max_scans or count, count)
+    images = [project_by_what_fits(scan(index), sensor, config.projection_variant)[0] for index in chosen]
+    return RangeImages(sensor, [_Images(images)])
 
 
 class _Images:

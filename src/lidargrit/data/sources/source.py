@@ -82,6 +82,10 @@ class Source(ABC):
         """
         raise DataError(f"{self.text}, which holds {self.kind}", "the points of scans", "name a data set or its folder")
 
+    def cut(self, num_points: int) -> "Source":
+        """Return the source with the first points of each scan alone; itself where it holds images."""
+        return self
+
     def learned_from(self) -> Provenance | None:
         """Return the training scans of the model behind the source; None where no model is behind it."""
         return None if self.folder is None else trained_on(self.folder)

@@ -36,6 +36,7 @@ class Protocol:
         num_scans: number of scans of each set; as many as there are if 0.
         data_set: name of the data set of the reference; any if empty.
         splits: names that the split of the reference may have; any if empty.
+        first_points: number of points of each cloud of the samples that are scored, the first of its file; 0 for all.
         departures: differences from the source, each with what it changes.
     """
 
@@ -50,6 +51,7 @@ class Protocol:
     num_scans: int = 0
     data_set: str = ""
     splits: tuple[str, ...] = ()
+    first_points: int = 0
     departures: tuple[str, ...] = ()
 
     def load_sensor(self) -> SensorModel | None:

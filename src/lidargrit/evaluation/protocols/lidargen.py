@@ -11,6 +11,7 @@ lidargen = Protocol(
         MetricChoice("frechet_range_distance", "exact"),
     ),
     sensor="hdl64e_kitti_360",
+    variant="clamped",
     num_scans=1000,  # what others who used its program report; its own scripts take as many scans as there are samples
     data_set="kitti_360",
     splits=("test", "paper/test", "lidargen-code/test"),

@@ -13,6 +13,7 @@ r2dm = Protocol(
         MetricChoice("bev_mmd", "r2dm"),
     ),
     sensor="hdl64e_kitti_360",
+    variant="clamped",
     range_m=(0.5, 63.0),
     num_scans=10000,
     data_set="kitti_360",

@@ -93,12 +93,15 @@ class PixelDecoder(nn.Module):
     Args:
         features: number of channels of the tokenizer's features; 0 for a decoder without a tokenizer.
         components: number of components of the distribution of a range that the tokenizer decodes.
+        gaps: whether what is decoded tells ranges of some pixels only, and 0 metres of the others.
 
     Source:
         Reed et al., Parallel Multiscale Autoregressive Density Estimation, 2017: phases from coarse to fine.
     """
 
-    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1) -> None:
+    def __init__(
+        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1, gaps: bool = False
+    ) -> None:
         super().__init__()
         rows, columns = (
             config.coarsest_cell * 2**halvings for halvings in (config.row_halvings, config.column_halvings)
@@ -112,7 +115,7 @@ class PixelDecoder(nn.Module):
         self.config, self.sensor = config, sensor
         self.mask = MaskNetwork(config, sensor, features)
         decoded = components if config.decoded_components and features else 0
-        self.range = RangeNetwork(config, sensor, features, decoded)
+        self.range = RangeNetwork(config, sensor, features, decoded, gaps)
 
     def forward(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
         """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.

@@ -128,6 +128,7 @@ class Guide(NamedTuple):
         observed: True where it was observed whether there is a return; None if nothing was observed.
         components: logits, centres and log scales of the components of the decoded distribution of v; a single one at
             ``v`` if only that is decoded.
+        told: True where ``v`` is told of a pixel; None if it is of all.
     """
 
     features: Float[Tensor, "B C H W"]
@@ -135,12 +136,12 @@ class Guide(NamedTuple):
     return_logits: Float[Tensor, "B H W"]
     observed: Bool[Tensor, "B H W"] | None = None
     components: Float[Tensor, "B 3 K H W"] | None = None
+    told: Bool[Tensor, "B H W"] | None = None
 
     def part(self, some: slice) -> "Guide":
         """Return the guide of some of the scans."""
-        observed = None if self.observed is None else self.observed[some]
-        components = None if self.components is None else self.components[some]
-        return Guide(self.features[some], self.v[some], self.return_logits[some], observed, components)
+        others = (None if each is None else each[some] for each in (self.observed, self.components, self.told))
+        return Guide(self.features[some], self.v[some], self.return_logits[some], *others)
 
     @classmethod
     def of(cls, decoded: Decoded) -> "Guide":
@@ -152,11 +153,12 @@ class Guide(NamedTuple):
                 "leave the pixel decoder out, or choose the tokenizer vqvae",
             )
         logits = at_least_32_bits(decoded.return_logits).clamp(-LOGIT_BOUND, LOGIT_BOUND)
-        v = at_least_32_bits(decoded.range_m).log1p()
+        told = decoded.range_m > 0
+        v = at_least_32_bits(decoded.range_m).log1p().where(told, TYPICAL_LOG_RANGE)
         components = decoded.components
         if components is None:
             components = torch.stack((torch.zeros_like(v), v, _DECODED_LOG_SCALE_M - v), 1)[:, :, None]
-        return cls(at_least_32_bits(decoded.features), v, logits, components=at_least_32_bits(components))
+        return cls(at_least_32_bits(decoded.features), v, logits, None, at_least_32_bits(components), told)
 
     @classmethod
     def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> "Guide":
@@ -180,23 +182,20 @@ class PhaseNetwork(nn.Module):
         super().__init__()
         self.phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
         self.sensor = sensor
-        self.guided_by_tokens = features > 0
         kept = kept if features else 0
         self.features = nn.Conv2d(features, kept, 1) if features else nn.Identity()
         self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
         guide = 4 * (kept + config.row_channels + 2)
         self.networks = nn.ModuleDict()
         for phases in self.by_lattice():
-            context = self.context_channels + (0 if features else self.added_without_tokens)
             lattice = phases[0].lattice
             width = widths[lattice.area >= _COARSE_AREA]
-            network = LatticeNetwork(guide, context, width, config.blocks, len(phases), outputs)
+            network = LatticeNetwork(guide, self.context_channels, width, config.blocks, len(phases), outputs)
             self.networks[lattice.name] = network
         self.register_buffer("before", generated_before(self.phases), persistent=False)
 
     before: Tensor
     context_channels: int
-    added_without_tokens = 0
 
     def guided(self, guide: Guide) -> dict[Lattice, Tensor]:
         """Return the first layer's output for the guide, (B, C, h, w), by lattice, the same for all phases."""

@@ -11,6 +11,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import Guide, PhaseNetwor
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,
+    at_phases,
     cells_of,
     phases_of,
     pixels_around,
@@ -22,6 +23,7 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE
 
 _FREE_COMPONENTS = 4  # of a range's distribution, begin at the decoded range; others begin at neighbours
 _DECODED_HEAD_START = 4.0  # of the logits of decoded components: before training they are nearly all there is
+_NEAR_V = 0.01  # a difference in v that is half of a large one: a hundredth of the range
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
 
@@ -29,15 +31,20 @@ class RangeNetwork(PhaseNetwork):
     """The distribution of a range, given the whole mask and the ranges of earlier pixels.
 
     Its components are free, or begin at what the neighbours suggest: at an edge the range may be that of either side.
-    Where no tokens tell what to expect of a pixel, the mean of its neighbours stands in.
+    Where nothing tells what to expect of a pixel, the mean of its neighbours stands in.
+
+    Args:
+        gaps: whether the guide tells ranges of some pixels only; without features it tells none.
     """
 
-    added_without_tokens = 1  # the expected range
-
-    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int, decoded: int = 0) -> None:
+    def __init__(
+        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, decoded: int = 0, gaps: bool = False
+    ) -> None:
         phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
         suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
-        self.context_channels = 4 * 3 + suggest.count + suggest.distances
+        self.has_gaps, self.is_told = gaps or not features, gaps
+        added = self.has_gaps + (4 + decoded) * self.is_told
+        self.context_channels = 4 * 3 + suggest.count + suggest.distances + added
         components = _FREE_COMPONENTS + suggest.count + decoded
         widths = (config.range_width, config.coarse_range_width or config.range_width)
         super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
@@ -61,10 +68,10 @@ class RangeNetwork(PhaseNetwork):
     ) -> RangeMixture:
         """Return the distributions of the ranges at phases of one lattice; later ranges have no influence."""
         candidates = self.candidates(phases, guide, return_mask, v)
-        contexts = self.context(phases, guide, return_mask, v, candidates)
         decoded = None
         if self.decoded and guide.components is not None:
             decoded = torch.stack([guide.components[(..., *phase.pixels)] for phase in phases])
+        contexts = self.context(phases, guide, return_mask, v, candidates, decoded)
         return self.mixture(self.outputs(phases, guided, contexts), candidates, decoded)
 
     def context(
@@ -74,6 +81,7 @@ class RangeNetwork(PhaseNetwork):
         return_mask: Bool[Tensor, "B H W"],
         v: Float[Tensor, "B H W"],
         candidates: Float[Tensor, "P B K h w"],
+        decoded: Float[Tensor, "P B 3 N h w"] | None = None,
     ) -> Float[Tensor, "P B D h w"]:
         """Return the mask, the known ranges beside the decoded ones, and how far the candidates are apart."""
         candidates, expected = candidates[:, :, :-1], candidates[:, :, -1:]
@@ -83,9 +91,15 @@ class RangeNetwork(PhaseNetwork):
         apart = self.suggest.differences(candidates.flatten(0, 1)).unflatten(0, candidates.shape[:2])
         dropped = (1 - returned).expand_as(generated)
         parts = [generated, dropped, generated * beside, (candidates - expected).clamp(-2, 2), apart]
-        if not self.guided_by_tokens:
-            parts[2] = generated * (beside - (expected - TYPICAL_LOG_RANGE)).clamp(-2, 2)
+        if self.has_gaps:
+            here = cells_of(guide.v[:, None], phases[0].lattice)
+            parts[2] = generated * (beside - (expected - here)).clamp(-2, 2)
             parts.append(expected - TYPICAL_LOG_RANGE)
+        if self.is_told and guide.told is not None:
+            told = cells_of(guide.told[:, None].to(v.dtype), phases[0].lattice)
+            parts.append(generated * told * _near(beside))
+            if decoded is not None:
+                parts.append(at_phases(guide.told, phases)[:, :, None] * _near(decoded[:, :, 1] - expected))
         return torch.cat(parts, 2)
 
     def candidates(
@@ -93,7 +107,7 @@ class RangeNetwork(PhaseNetwork):
     ) -> Float[Tensor, "P B K h w"]:
         """Return what neighbours suggest, as ln(1 + range), and last what is expected without them.
 
-        Expected is the decoded range, or without tokens the mean of the neighbours.
+        Expected is the decoded range, or where the guide tells none the mean of the neighbours.
         """
         return torch.stack([self._candidates(phase, guide, return_mask, v) for phase in phases])
 
@@ -101,10 +115,11 @@ class RangeNetwork(PhaseNetwork):
         self, phase: Phase, guide: Guide, return_mask: Bool[Tensor, "B H W"], v: Float[Tensor, "B H W"]
     ) -> Float[Tensor, "B K h w"]:
         expected = guide.v[(..., *phase.pixels)]
-        if not self.guided_by_tokens and phase.rank:
+        if self.has_gaps and phase.rank:
             near, known = pixels_around(phase, v, return_mask, phase.neighbours)
             count, total = known.sum(1), torch.where(known, near, 0.0).sum(1)
-            expected = torch.where(count > 0, total / count.clamp(min=1), expected)
+            open_ = count > 0 if guide.told is None else (count > 0) & ~guide.told[(..., *phase.pixels)]
+            expected = torch.where(open_, total / count.clamp(min=1), expected)
         return torch.cat((self.suggest(phase, v, return_mask, expected), expected[:, None]), 1)
 
     def mixture(
@@ -136,3 +151,8 @@ class RangeNetwork(PhaseNetwork):
         log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
         logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
         return RangeMixture(logits, centres, log_scales, self.limits_m)
+
+
+def _near(apart: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+    """Return differences in v between -1 and 1, so that small ones are told apart."""
+    return apart / (apart.abs() + _NEAR_V)

@@ -38,7 +38,7 @@ from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision, at_least_32_bits, dtype_of
 from lidargrit.nn.quantiser import CodebookLoss
 from lidargrit.scans.example import Example
-from lidargrit.scans.projection import RangeEncoding
+from lidargrit.scans.projection import EncodingName, RangeEncoding
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
 
@@ -91,7 +91,7 @@ class VqvaeConfig(TokenizerConfig):
     num_codes: NumCodes = 512
     dropout: ShareBelow1 = 0.2
     padding: Padding = "zero"
-    range_encoding: Literal["linear", "log", "inverse"] = "linear"
+    range_encoding: EncodingName = "linear"
     raydrop_loss: bool = True
     raydrop_weight: Weight = 0.1
     reconstruction: Literal["paper", "reference", "returns"] = "paper"

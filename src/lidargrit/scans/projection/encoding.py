@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+EncodingName = Literal["linear", "log", "inverse"]
+
 
 class _Curve(NamedTuple):
     """What is encoded linearly, of a number and of a tensor in metres, and back."""
@@ -18,7 +20,7 @@ class _Curve(NamedTuple):
     back: Callable[[Tensor], Tensor]
 
 
-_CURVES = {
+_CURVES: dict[EncodingName, _Curve] = {
     "linear": _Curve(lambda range_m: range_m, lambda range_m: range_m, lambda curve: curve),
     "log": _Curve(
         lambda range_m: math.log2(1 + range_m), lambda range_m: torch.log2(1 + range_m), lambda curve: curve.exp2() - 1
@@ -38,7 +40,7 @@ class RangeEncoding:
         linear: hamedhaghighi/LidarGRIT@a3f86e7. The paper gives no formula.
     """
 
-    kind: Literal["linear", "log", "inverse"]
+    kind: EncodingName
     range_min_m: float
     range_max_m: float
 

@@ -34,8 +34,9 @@ def project(
         method: projection method, ``spherical`` (rows by elevation) or ``unfolding`` (rows by ring); the sensor's own
             if not given.
         variant: ``exact`` floors, leaves out points beyond the sensor's span or limits before the nearest one wins, and
-            refuses a scan that does not fit. ``reference`` repeats LidarGRIT's program: it rounds, clips points outside
-            into the border pixels, and loses a pixel whose nearest point is beyond the limits; of scans that do not fit
+            refuses a scan that does not fit. ``clamped`` repeats the programs of R2DM, LiDARGen and LiDARCrafter: it
+            moves points above or below all rows into the border rows, and loses a pixel whose nearest point is beyond
+            the limits. ``reference`` repeats LidarGRIT's program: it does so too, and rounds; of scans that do not fit
             only those are refused of which most points would lie in rows where the sensor does not look.
         partial: whether a scan of a part of the circle is accepted. A pixel without a point is then unknown; it does
             not mean a beam that did not return.
@@ -49,13 +50,15 @@ def project(
             would fit, or the projection.
 
     Source:
-        Haghighi et al., LidarGRIT, 2024, section 3.1; program hamedhaghighi/LidarGRIT@a3f86e7.
+        Haghighi et al., LidarGRIT, 2024, section 3.1, and its program @a3f86e7; kazuto1011/r2dm@ad66e71.
     """
     nearest = _nearest(scan, sensor, method, variant, partial, refuse=True)
     point_of_pixel, range_m = (array[:, :: sensor.column_stride] for array in nearest)
     filled = point_of_pixel >= 0
-    if variant == "reference":  # there the limits are applied to the winner, and strictly
-        filled &= (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
+    if variant != "exact":  # there the limits are applied to the winner
+        filled &= within_limits(range_m, sensor)
+        if variant == "reference":  # strictly
+            filled &= (range_m > sensor.range_min_m) & (range_m < sensor.range_max_m)
         point_of_pixel = np.where(filled, point_of_pixel, -1)
     if not filled.any():
         raise ScanError(
@@ -121,7 +124,7 @@ def index_map(
 ) -> Int32[np.ndarray, "H fine_W"]:
     """Return the index of the point that fills each pixel, -1 for none, before any column is left out.
 
-    Args, Raises: as for :func:`project`; the ``reference`` variant takes every scan here, as its program does.
+    Args, Raises: as for :func:`project`; variants of programs take every scan here, as these do.
     """
     return _nearest(scan, sensor, method, variant, partial, refuse=variant == "exact")[0]
 
@@ -138,7 +141,7 @@ def _nearest(
     pixels = pixel_coordinates(scan, sensor, method, variant)
     for problem in fit_problems(scan, sensor, method, pixels, partial, variant) if refuse else ():
         raise problem
-    if variant == "reference":
+    if variant != "exact":
         return pixels.nearest(np.ones(len(scan), dtype=bool))
     return pixels.nearest(pixels.in_rows() & within_limits(pixels.range_m, sensor))
 

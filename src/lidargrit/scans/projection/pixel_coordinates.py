@@ -11,7 +11,7 @@ from lidargrit.scans.projection import spherical, unfolding
 from lidargrit.scans.sensors import ProjectionName, SensorModel
 from lidargrit.scans.types import Scan
 
-ProjectionVariant = Literal["exact", "reference"]
+ProjectionVariant = Literal["exact", "reference", "clamped"]
 
 _ROUNDING = 2.0**-20  # of a range: more than squares, sums and roots of coordinates of 32 bits lose
 
@@ -94,10 +94,17 @@ def pixel_coordinates(
         row = spherical.rows(xyz_m, range_m, row_elevation_rad(sensor)).astype(np.int32)
         measured = ~scan.filled.numpy()
         row[measured] = unfolding.rings_from_firing_order(np.ascontiguousarray(xyz_m[:, measured]))
+    if variant == "clamped":
+        row = row.clip(0, height - 1)
     return PixelCoordinates(row, unfolding.columns(xyz_m, width, sensor.first_edge_rad), range_m, height, width)
 
 
-def within_limits(range_m: Float32[np.ndarray, "n"], sensor: SensorModel) -> Bool[np.ndarray, "n"]:
+def variant_named(name: str) -> ProjectionVariant:
+    """Return the variant of the projection that has a name; the exact one for a name of none."""
+    return next((variant for variant in get_args(ProjectionVariant) if variant == name), "exact")
+
+
+def within_limits(range_m: Float32[np.ndarray, "*n"], sensor: SensorModel) -> Bool[np.ndarray, "*n"]:
     """Return which ranges lie within the sensor's limits; the limits themselves are inside."""
     return (range_m >= sensor.range_min_m) & (range_m <= sensor.range_max_m)
 

@@ -92,32 +92,6 @@ def quads(corners_m: Num[np.ndarray, "*lead 4 3"]) -> Float32[np.ndarray, "*lead
     return np.asarray(corners_m, np.float32)[..., [[0, 1, 2], [0, 2, 3]], :]
 
 
-def tubes(
-    start_m: Num[np.ndarray, "n 3"],
-    end_m: Num[np.ndarray, "n 3"],
-    start_radius_m: float | Num[np.ndarray, " n"],
-    end_radius_m: float | Num[np.ndarray, " n"],
-    sides: int = 6,
-) -> Float32[np.ndarray, "n t 3 3"]:
-    """Return tapered prisms from start to end, with 2 triangles a side and a cap of ``sides`` at the end."""
-    start, end = np.asarray(start_m, np.float32), np.asarray(end_m, np.float32)
-    axis = end - start
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    helper = np.where(np.abs(axis[:, 2:]) < 0.9, np.array([[0, 0, 1]], np.float32), np.array([[1, 0, 0]], np.float32))
-    across = np.cross(axis, helper).astype(np.float32)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    up = np.cross(axis, across)
-    turn = (2 * np.pi / sides * np.arange(sides)).astype(np.float32)
-    ring = np.cos(turn)[:, None] * across[:, None] + np.sin(turn)[:, None] * up[:, None]  # (n, sides, 3)
-    radius_0, radius_1 = (np.broadcast_to(np.float32(r), len(start)) for r in (start_radius_m, end_radius_m))
-    low = start[:, None] + ring * radius_0[:, None, None]
-    high = end[:, None] + ring * radius_1[:, None, None]
-    low_next, high_next = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
-    tip = np.broadcast_to(end[:, None], low.shape)
-    faces = [(low, low_next, high_next), (low, high_next, high), (high, high_next, tip)]
-    return np.concatenate([np.stack(face, axis=2) for face in faces], axis=1)
-
-
 def sweep(
     path_m: Num[np.ndarray, "k 3"], radius_m: Num[np.ndarray, " k"], sides: int = 8
 ) -> Float32[np.ndarray, "t 3 3"]:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.presets import DIFFUSION_ON_KITTI_360, KITTI_360, MINUTES, STREETS, preset
+from lidargrit.generation.presets import DIFFUSION_ON_KITTI_360, KITTI_360, MINUTES, NUSCENES, STREETS, preset
 from lidargrit.systems.r2dm.system import R2dmConfig
 from lidargrit.systems.r2dm.unet import UnetConfig
 
@@ -22,5 +22,11 @@ PRESETS = {
         R2dmConfig(),
         published="LidarGRIT's table 1: SWD 20.82e-2, BEV MMD 4.00e-4, BEV JSD 4.55e-2, FPD 10.84 (5,000 test scans)",
         diffusion=replace(DIFFUSION_ON_KITTI_360, scans=2_400_000, precision="auto"),  # the reference's is float16
+    ),
+    "r2dm_nuscenes": preset(
+        "R2DM on nuScenes, 32x1024, a row for each laser (set data.train and data.val to nuscenes:ROOT:SPLIT)",
+        NUSCENES,
+        R2dmConfig(),
+        diffusion=replace(DIFFUSION_ON_KITTI_360, scans=2_400_000, precision="auto"),
     ),
 }

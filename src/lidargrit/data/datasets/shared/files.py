@@ -19,8 +19,10 @@ from lidargrit.core.errors import DataError, OutputError, ScanError, UsageError,
 from lidargrit.core.untrusted import check_word
 from lidargrit.data import formats
 from lidargrit.data.datasets import ScanDataset, recognise
+from lidargrit.data.datasets.shared.poses_beside import motion_beside
 from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints, ScanFormat
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 
@@ -113,6 +115,11 @@ class FileDataset(ScanDataset):
     def path(self, index: int) -> Path:
         """Return the file that holds a scan."""
         return self._scans[index][0]
+
+    def motion(self, index: int) -> Motion:
+        """Return time and pose of a scan by ``times.txt`` and ``poses.txt`` in its folder or above it."""
+        path = self.path(index)
+        return Motion() if path in self._several else motion_beside(path)
 
     def companions(self, index: int) -> tuple[Path, ...]:
         """Return the other files that a scan is read from; tells formats apart by the ending, without opening any."""

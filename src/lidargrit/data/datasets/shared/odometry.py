@@ -18,7 +18,8 @@ _POSE = "12 finite numbers in each row, the first three rows of a pose"
 def motions(sequence: Path) -> tuple[Motion, ...]:
     """Return time and pose of every scan of a sequence, by the number of its file.
 
-    Poses of KITTI are those of its left camera; ``Tr`` of ``calib.txt`` leads from the sensor to that camera.
+    Poses of KITTI are those of its left camera; ``Tr`` of ``calib.txt`` leads from the sensor to that camera. Without
+    that file poses are the sensor's own.
 
     Args:
         sequence: folder that holds the files; a time or pose without its files is unknown.
@@ -45,6 +46,8 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
 
 
 def _camera_from_sensor(path: Path) -> Float64[np.ndarray, "4 4"]:
+    if not path.exists():
+        return np.eye(4)
     rows = [line.removeprefix("Tr:") for line in _lines(path) if line.startswith("Tr:")]
     found = _numbers(rows, 12, path, f"a row 'Tr:' with {_POSE}")
     if len(found) != 1 or abs(np.linalg.det(found.reshape(3, 4)[:, :3])) < 0.5:  # a rotation has 1

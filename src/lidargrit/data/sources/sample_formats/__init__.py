@@ -1,4 +1,4 @@
-"""Samples as other programs write them, one tensor a file: folder of .pth → range images."""
+"""Samples as other programs write them, in files of tensors or of text: folder → range images."""
 
 import math
 import re
@@ -22,87 +22,10 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 
 _BYTES_AT_MOST = 1 << 30  # of one file, unpacked: a batch of 500 scans of 5 channels has 655 MB
 _SCANS_AT_MOST = 1 << 20
+_POINT_WITHOUT_COLOUR = re.compile(rb"(-?\d+\.\d{3} ){3}0\.000 0\.000 0\.000\r?\n")
 
 Decoded = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
 """Metres, 0 where nothing returned; reflectance in [0, 1] if there is one."""
-
-
-@dataclass(frozen=True)
-class SampleFormat:
-    """The format in which one program stores its samples.
-
-    Args:
-        title: name of the program that writes such samples.
-        channels: number of channels of its tensors, which are (channels, rows, columns) or (scans, channels, rows,
-            columns).
-        sensors: possible sensors, each as a name, the number of fine columns (0 for the sensor's own), and the step
-            between the columns that are kept.
-        variant: projection variant of its training scans.
-        decode: function from the values of a tensor to metres.
-    """
-
-    title: str
-    source: str
-    channels: int
-    sensors: tuple[tuple[str, int, int], ...]
-    variant: str
-    decode: Callable[[Tensor], Decoded]
-
-    def sensor_of(self, rows: int, columns: int) -> SensorModel | None:
-        """Return the sensor that has images of a size, None if there is none."""
-        for name, fine_columns, stride in self.sensors:
-            sensor = load_sensor(name)
-            sensor = sensor.with_columns(fine_columns, stride) if fine_columns else sensor
-            if (sensor.height, sensor.width) == (rows, columns):
-                return sensor
-        return None
-
-
-def load_sample_format(name: str) -> SampleFormat:
-    """Return a sample_format by its name, or raise UnknownNameError."""
-    name, known = name.replace("-", "_"), discovery.names("sample-formats")
-    if name not in known:
-        raise UnknownNameError(f"samples of {name!r}", f"those of {nearest_names(name, known, 9)}", "choose one")
-    return discovery.load_instance("sample-formats", name, SampleFormat)
-
-
-def is_tensor_folder(folder: Path) -> bool:
-    """Return whether a folder holds samples as tensors, and no scans, beside which weights may lie."""
-    try:
-        tensors = folder.is_dir() and any(True for _ in folder.glob("[!.]*.pth"))
-        return tensors and not any(formats.candidates(path) for path in folder.iterdir())
-    except OSError:  # a name longer than names can be
-        return False
-
-
-def recognise(folder: Path) -> str:
-    """Name the program that wrote a folder of tensors, by the number of channels of the first."""
-    path = _paths(folder)[0]
-    shape = tuple(read_tensor(path).shape)
-    known = {load_sample_format(name).channels: name for name in discovery.names("sample-formats")}
-    if len(shape) < 3 or shape[-3] not in known:
-        wanted = ", ".join(f"{channels} channels ({name})" for channels, name in sorted(known.items()))
-        raise ScanError(f"a tensor of {shape} in {path}", wanted, "name what wrote it with --samples-format")
-    return known[shape[-3]]
-
-
-def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -> RangeImages:
-    """Return the samples of a folder of tensors, in the order of their numbers; read when asked for.
-
-    Args:
-        folder: folder of ``.pth`` files, with one scan or one batch of scans each.
-        name: name of the sample format; recognised from the number of channels if empty.
-        count: largest number of scans, evenly spaced; all if not given.
-    """
-    form = load_sample_format(name or recognise(folder))
-    store = _Tensors(_paths(folder), form, count)
-    return RangeImages(store.sensor, [store])
-
-
-def sensor_of_tensors(folder: Path, name: str = "") -> SensorModel:
-    """Return the sensor that the first file of a folder of tensors fits."""
-    path = _paths(folder)[0]
-    return _sensor_of(read_tensor(path), path, load_sample_format(name or recognise(folder)))
 
 
 def read_tensor(path: Path) -> Tensor:
@@ -126,6 +49,94 @@ def read_tensor(path: Path) -> Tensor:
         reason = str(error).partition("\n")[0][:120]
         raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {reason})", wanted, cure) from None
     return tensor.detach().float()
+
+
+@dataclass(frozen=True)
+class SampleFormat:
+    """The format in which one program stores its samples.
+
+    Args:
+        title: name of the program that writes such samples.
+        channels: number of channels of its tensors, which are (channels, rows, columns) or (scans, channels, rows,
+            columns).
+        sensors: possible sensors, each as a name, the number of fine columns (0 for the sensor's own), and the step
+            between the columns that are kept.
+        variant: projection variant of its training scans.
+        decode: function from the values of a tensor to metres.
+        suffix: end of the names of its files.
+        read: function that reads the tensor of a file.
+    """
+
+    title: str
+    source: str
+    channels: int
+    sensors: tuple[tuple[str, int, int], ...]
+    variant: str
+    decode: Callable[[Tensor], Decoded]
+    suffix: str = ".pth"
+    read: Callable[[Path], Tensor] = read_tensor
+
+    def sensor_of(self, rows: int, columns: int) -> SensorModel | None:
+        """Return the sensor that has images of a size, None if there is none."""
+        for name, fine_columns, stride in self.sensors:
+            sensor = load_sensor(name)
+            sensor = sensor.with_columns(fine_columns, stride) if fine_columns else sensor
+            if (sensor.height, sensor.width) == (rows, columns):
+                return sensor
+        return None
+
+
+def load_sample_format(name: str) -> SampleFormat:
+    """Return a sample_format by its name, or raise UnknownNameError."""
+    name, known = name.replace("-", "_"), discovery.names("sample-formats")
+    if name not in known:
+        raise UnknownNameError(f"samples of {name!r}", f"those of {nearest_names(name, known, 9)}", "choose one")
+    return discovery.load_instance("sample-formats", name, SampleFormat)
+
+
+def is_tensor_folder(folder: Path) -> bool:
+    """Return whether a folder holds samples of another program, and no scans, beside which weights may lie."""
+    try:
+        samples = folder.is_dir() and (
+            any(True for _ in folder.glob("[!.]*.pth")) or _holds_points_without_colour(folder)
+        )
+        return samples and not any(formats.candidates(path) for path in folder.iterdir())
+    except OSError:  # a name longer than names can be
+        return False
+
+
+def recognise(folder: Path) -> str:
+    """Name the program that wrote a folder of samples, by the number of channels of the first tensor."""
+    if _holds_points_without_colour(folder):
+        return "lidm"
+    path = _paths(folder)[0]
+    shape = tuple(read_tensor(path).shape)
+    forms = {name: load_sample_format(name) for name in discovery.names("sample-formats")}
+    known = {form.channels: name for name, form in forms.items() if form.suffix == ".pth"}
+    if len(shape) < 3 or shape[-3] not in known:
+        wanted = ", ".join(f"{channels} channels ({name})" for channels, name in sorted(known.items()))
+        raise ScanError(f"a tensor of {shape} in {path}", wanted, "name what wrote it with --samples-format")
+    return known[shape[-3]]
+
+
+def read_tensor_folder(folder: Path, name: str = "", count: int | None = None) -> RangeImages:
+    """Return the samples of a folder of tensors, in the order of their numbers; read when asked for.
+
+    Args:
+        folder: folder of files with one scan or one batch of scans each.
+        name: name of the sample format; recognised from the number of channels if empty.
+        count: largest number of scans, evenly spaced; all if not given.
+    """
+    form = load_sample_format(name or recognise(folder))
+    store = _Tensors(_paths(folder, form.suffix), form, count)
+    return RangeImages(store.sensor, [store])
+
+
+def sensor_of_tensors(folder: Path, name: str = "") -> SensorModel:
+    """Return the sensor that the first file of a folder of tensors fits."""
+    form = load_sample_format(name or recognise(folder))
+    path = _paths(folder, form.suffix)[0]
+    return _sensor_of(form.read(path), path, form)
 
 
 class _Tensors:
@@ -164,7 +175,7 @@ class _Tensors:
     def _tensor(self, path: Path) -> Tensor:
         known, tensor = self._last  # one pair, replaced at once: safe from several threads
         if known != path:
-            tensor = read_tensor(path)
+            tensor = self._format.read(path)
             self._last = (path, tensor)
         return tensor
 
@@ -199,11 +210,17 @@ def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
     return values.contiguous().numpy().astype(np.float32, copy=False)
 
 
-def _paths(folder: Path) -> list[Path]:
-    found = sorted(folder.glob("[!.]*.pth"), key=_order)
+def _paths(folder: Path, suffix: str = ".pth") -> list[Path]:
+    found = sorted(folder.glob(f"[!.]*{suffix}"), key=_order)
     if not found:
-        raise DataError(f"no .pth file in {folder}", "samples as tensors, one file each", "check the folder")
+        raise DataError(f"no {suffix} file in {folder}", "samples, in files of their own", "check the folder")
     return found
+
+
+def _holds_points_without_colour(folder: Path) -> bool:
+    """Return whether a folder holds text in which each line has x, y, z in millimetres and the three zeros of LiDM."""
+    first = min(folder.glob("[!.]*.txt"), default=None)
+    return first is not None and bool(_POINT_WITHOUT_COLOUR.match(formats.first_bytes(first, 100)))
 
 
 def _order(path: Path) -> tuple[list[int], str]:

@@ -20,6 +20,6 @@ lidargen = SampleFormat(
     source="vzyrianov/lidargen@b88030b: LiDARGen/runners/ncsn_runner.py, metrics/histogram/hist_utils.py",
     channels=2,
     sensors=(("hdl64e_kitti_360", 0, 1),),
-    variant="exact",
+    variant="clamped",
     decode=decode,
 )

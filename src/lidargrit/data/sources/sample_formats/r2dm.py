@@ -20,6 +20,6 @@ r2dm = SampleFormat(
         ("hdl64e_kitti_360", 0, 1),
         ("hdl32e_nuscenes", 0, 1),
     ),  # by elevation, its default; its images by ring look the same
-    variant="exact",
+    variant="clamped",
     decode=decode,
 )

@@ -1,0 +1,206 @@
+"""Drives → tables: errors of forecasts of their scans, and how well scans that follow one another fit together."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import astuple, dataclass, replace
+from statistics import median
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from lidargrit.core import reporting
+from lidargrit.core.determinism import evenly_spaced, scan_seed
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.table import Table, render
+from lidargrit.data.images import RangeImages
+from lidargrit.data.pasts import Pasts
+from lidargrit.data.sources import open_source
+from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.drive_errors import (
+    ForecastErrors,
+    consistency_chamfer_m2,
+    consistency_error_m,
+    forecast_errors,
+)
+from lidargrit.evaluation.intervals import Estimate
+from lidargrit.generation.generator import Generator, load
+from lidargrit.nn.devices import usable_device
+from lidargrit.scans.motion import transform_between
+from lidargrit.scans.past import Past
+from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.types import RangeImage
+from lidargrit.scans.warp import warp
+
+HORIZONS_S = (0.1, 0.5, 1.0, 3.0)
+_PAST_SCANS = 5
+_STANDS_M_PER_S = 0.5  # below, a forecast is as good as the last scan
+_LONGEST_OFF = 0.25  # of a horizon, by which the nearest whole number of steps may miss it
+_TTCE_STEPS, _CTC_STEPS = (3, 4), (1, 2, 3, 4)
+Measure = Callable[[np.ndarray, np.ndarray, np.ndarray], float]  # of an earlier and a later scan, and their transform
+_HEAD = ("forecast", "L1 [m]", "AbsRel", "median [m]", "covered", "mask right", "chamfer [m2]")
+
+
+@dataclass(frozen=True, eq=False)
+class _Drives:
+    """Range images of one source with their drives."""
+
+    images: RangeImages
+    pasts: Pasts
+
+    @classmethod
+    def of(cls, text: str, config: EvalConfig, model: Generator | None = None) -> "_Drives":
+        source = open_source(text, config.data.bad_points)
+        data = replace(config.data_config(), max_scans=0)
+        named = replace(data, sensor=config.sensor).load_sensor() if config.sensor else None
+        images = source.images(model.sensor if model else named, source.as_projected(data))
+        return cls(images, Pasts(images, _PAST_SCANS))
+
+    def windows(self, horizon_s: float, at_most: int) -> list[tuple[int, int]]:
+        """Return scans that are so many seconds after a past of five scans, each with the steps to the latest one."""
+        found = []
+        for drive in self.pasts.drives:
+            times_s = [self.pasts.motion(number).time_s or 0.0 for number in drive]
+            if len(drive) < 2:
+                continue
+            period_s = median(np.diff(times_s))
+            gap = max(1, round(horizon_s / period_s))
+            if abs(gap * period_s - horizon_s) <= _LONGEST_OFF * horizon_s:
+                found += [(number, gap) for number in drive[gap + _PAST_SCANS - 1 :]]
+        return [found[at] for at in evenly_spaced(min(at_most or len(found), len(found)), len(found))]
+
+
+def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple[str, dict[str, Any]]:
+    """Forecast scans of drives from the five before them, whose poses and their own are known.
+
+    Scans of a car that stands are left out. Besides the model, these are forecast: ``copied``, the last scan;
+    ``warped``, its returns moved by the car's motion; ``warped_cache``, those of all five; and the same by the poses
+    that follow from a constant speed.
+
+    Args:
+        model: run of a generator that takes a past; none if empty.
+
+    Returns:
+        a table for each horizon, and their plain values.
+    """
+    generator = _forecaster(model, config.device) if model else None
+    drives = _Drives.of(source, config, generator)
+    tables, values = [], []
+    for horizon_s in HORIZONS_S:
+        errors, standing = _errors_at(drives, horizon_s, config.max_scans, generator, model)
+        title, count = f"{horizon_s:g} s ahead", len(next(iter(errors.values()), []))
+        if not count:
+            lacking = f"{title}: no drive of {source} moves and is so long, with {_PAST_SCANS} scans before"
+            tables.append(Table(sentences=(lacking,)))
+            continue
+        rows = {name: _estimates(each) for name, each in errors.items()}
+        left_out = (f"{standing} scans of a standing car are left out",) if standing else ()
+        cells = tuple((name, *(each.as_text(".3f") for each in row.values())) for name, row in rows.items())
+        tables.append(Table(_HEAD, cells, f"{title}: {count} scans", notes=left_out))
+        plain = {name: {key: vars(each) for key, each in row.items()} for name, row in rows.items()}
+        values.append({"horizon_s": horizon_s, "scans": count, "standing": standing, "forecasts": plain})
+    if not values:
+        cure = "name longer ones: lidargrit simulate DRIVES --frames 12 -n 120"
+        raise DataError(f"drives of {source} of which none moves for {_PAST_SCANS + 1} scans", "longer drives", cure)
+    about = {"protocol": "forecast", "samples": source, "model": model, "settings": config.facts()}
+    return render(tables), {**about, "horizons": values}
+
+
+def _forecaster(model: str, device: str) -> Generator:
+    generator = load(model)
+    if Past not in generator.takes:
+        got = f"the model {model}, which takes no past"
+        raise ConfigError(got, "one that forecasts", "leave --model out, or train one with data.condition=past")
+    return generator.to(usable_device(device))
+
+
+def _errors_at(
+    drives: _Drives, horizon_s: float, at_most: int, generator: Generator | None, model: str
+) -> tuple[Mapping[str, list[ForecastErrors]], int]:
+    """Return the errors of every forecast at one horizon, and how many scans of a standing car were left out."""
+    found, standing = dict[str, list[ForecastErrors]](), 0
+    windows = drives.windows(horizon_s, at_most)
+    with reporting.progress(f"forecasting {horizon_s:g} s", len(windows)) as progress:
+        for number, gap in windows:
+            past = drives.pasts.of([number], gaps=[gap])
+            progress.advance(1)
+            if float(past.transforms[0, -1, :3, 3].norm()) < _STANDS_M_PER_S * float(past.ages_s[0, -1]):
+                standing += 1
+                continue
+            true_m = drives.images.batch([number]).range_m[0].double()
+            forecasts = baselines(past, gap)
+            if generator is not None:
+                made = generator.sample([scan_seed(0, number)], past)
+                forecasts[model] = made.range_m[0].double().cpu()
+            for name, range_m in forecasts.items():
+                found.setdefault(name, []).append(forecast_errors(range_m, true_m, drives.images.sensor))
+    return found, standing
+
+
+def baselines(past: Past, gap: int) -> dict[str, Float64[Tensor, "H W"]]:
+    """Return forecasts of one scan in metres without a model, by their names; 0 where nothing returns.
+
+    Args:
+        past: past of one scan.
+        gap: steps from the latest past scan to the one that is forecast.
+    """
+    warped = warp(past)
+    steady = warp(constant_speed(past, gap))
+    return {
+        "copied": warped.copied_m[0],
+        "warped": warped.last.range_m[0],
+        "warped_cache": warped.nearest.range_m[0],
+        "warped_cache, constant speed": steady.nearest.range_m[0],
+    }
+
+
+def constant_speed(past: Past, gap: int) -> Past:
+    """Return the past as it would be if the sensor went on as in its last step, for that many steps."""
+    to_latest = torch.linalg.inv(past.transforms[:, -1:]) @ past.transforms
+    step = to_latest[:, -2:-1]  # from the frame before the latest one to that
+    return replace(past, transforms=torch.linalg.matrix_power(step, gap) @ to_latest)
+
+
+def _estimates(errors: Sequence[ForecastErrors]) -> dict[str, Estimate]:
+    columns = zip(*map(astuple, errors), strict=True)
+    return {name: Estimate.of(column) for name, column in zip(ForecastErrors.names(), columns, strict=True)}
+
+
+def evaluate_drives(sources: Sequence[str], config: EvalConfig) -> tuple[str, dict[str, Any]]:
+    """Measure how well scans of drives fit together by their poses: generated drives beside recorded ones.
+
+    Returns:
+        a table with a row for each source, and its plain values.
+    """
+    head = ["drives", "scans", *(f"TTCE {steps} [m]" for steps in _TTCE_STEPS), *(f"CTC {n} [m2]" for n in _CTC_STEPS)]
+    rows, values = [], []
+    for text in sources:
+        drives = _Drives.of(text, config)
+        ttce = [_fits(drives, steps, config.max_scans, consistency_error_m) for steps in _TTCE_STEPS]
+        ctc = [_fits(drives, steps, config.max_scans, consistency_chamfer_m2) for steps in _CTC_STEPS]
+        count = sum(len(drive) for drive in drives.pasts.drives)
+        rows.append((text, str(count), *(each.as_text(".3f") for each in (*ttce, *ctc))))
+        values.append({"drives": text, "scans": count, "ttce_m": [*map(vars, ttce)], "ctc_m2": [*map(vars, ctc)]})
+    about = {"protocol": "drive", "settings": config.facts()}
+    return render([Table(tuple(head), tuple(rows))]), {**about, "sets": values}
+
+
+def _fits(drives: _Drives, steps: int, at_most: int, measure: Measure) -> Estimate:
+    """Return the mean over pairs of scans so many steps apart of what is measured of them."""
+    pairs = [(one, later) for drive in drives.pasts.drives for one, later in zip(drive, drive[steps:], strict=False)]
+    chosen = [pairs[at] for at in evenly_spaced(min(at_most or len(pairs), len(pairs)), len(pairs))]
+    values = []
+    with reporting.progress(f"pairs {steps} apart", len(chosen)) as progress:
+        for one, later in chosen:
+            images = drives.images.batch([one, later])
+            then, now = drives.pasts.motion(one).pose, drives.pasts.motion(later).pose
+            if then is not None and now is not None:  # as in all drives
+                transform = transform_between(then, now).numpy()
+                values.append(measure(_points_m(images[0]), _points_m(images[1]), transform))
+            progress.advance(1)
+    return Estimate.of(values)
+
+
+def _points_m(image: RangeImage) -> Float64[np.ndarray, "n 3"]:
+    return points_of_pixels(image)[image.return_mask].double().numpy()

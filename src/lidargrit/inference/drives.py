@@ -1,0 +1,207 @@
+"""A generator that takes a past, and a way → generated scans in a row, each given the last ones, as KITTI sequences."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from lidargrit.core import reporting
+from lidargrit.core.determinism import scan_seed
+from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.data.datasets import ScanDataset, open_dataset
+from lidargrit.data.drives import write_motions
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.scan_folder import KittiTree, ScanFolder
+from lidargrit.data.trajectories import read_trajectory
+from lidargrit.data.windows import TimedScan, drives_in
+from lidargrit.generation.conditions.past import PastTold
+from lidargrit.generation.generator import Generator, SamplingT
+from lidargrit.inference.samples import sampling_identity
+from lidargrit.scans.condition import NOTHING, Condition
+from lidargrit.scans.fine_columns import in_fine_columns
+from lidargrit.scans.past import Past
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.types import RangeImage
+
+MANIFEST = "drive.json"
+PERIOD_S, _SPEED_M_S = 0.1, 10.0  # of a drive from nothing
+
+Pose = Float64[Tensor, "4 4"]
+
+
+class Seen(NamedTuple):
+    """A scan before those that are generated.
+
+    Args:
+        range_m: ranges in all fine columns of the sensor, in metres, 0 where nothing returned.
+        pose: matrix from the sensor's frame to that of the drive.
+        time_s: time on the clock of the drive.
+    """
+
+    range_m: Float[Tensor, "H fine_W"]
+    pose: Pose
+    time_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """What a drive begins with, and where its generated scans are made.
+
+    Args:
+        seen: scans before the first generated one, in order of time.
+        poses: pose of each generated scan.
+        begin_s: time of the first one.
+        period_s: time from one to the next.
+    """
+
+    seen: Sequence[Seen]
+    poses: Sequence[Pose]
+    begin_s: float = 0.0
+    period_s: float = PERIOD_S
+
+
+def path_of(frames: int, path: Path | None = None) -> Way:
+    """Return a way of a drive from nothing: along the poses of a file or KITTI sequence, or 10 m/s straight ahead.
+
+    Args:
+        path: file or folder for :func:`lidargrit.data.trajectories.read_trajectory`; None for a straight way.
+    """
+    if frames < 1:
+        raise ConfigError(f"--frames {frames}", "at least 1", "raise it")
+    if path is None:
+        poses = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
+        poses[:, 0, 3] = torch.arange(frames) * (_SPEED_M_S * PERIOD_S)
+        return Way((), [*poses])
+    known = read_trajectory(path)
+    times_s = known.times_s[0] + PERIOD_S * np.arange(frames)
+    if not known.covers(times_s):
+        lasts = known.times_s[-1] - known.times_s[0]
+        got = f"{frames} scans, {PERIOD_S:g} s apart, along {path}, which lasts {lasts:.1f} s"
+        raise ConfigError(got, "no more than its length", f"take --frames {int(lasts / PERIOD_S) + 1}, or another path")
+    turns, places = known.at(times_s)
+    poses = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
+    poses[:, :3, :3], poses[:, :3, 3] = torch.from_numpy(turns.as_matrix()), torch.from_numpy(places)
+    return Way((), [*poses])
+
+
+def continued(drive: str, sensor: SensorModel, frames: int, after: int | None, constant_speed: bool) -> Way:
+    """Return the way on from a scan of a recorded drive.
+
+    Args:
+        drive: source of scans with times and poses; the last of its drives counts.
+        frames: number of scans to come.
+        after: number of the last scan that is seen, from 0; the last one of the drive if not given.
+        constant_speed: whether later poses of the drive are left alone. Where it has none, the last step is repeated.
+    """
+    dataset = open_dataset(drive)
+    scans = [TimedScan(dataset.name(at), dataset.recording(at), dataset.motion(at)) for at in range(len(dataset))]
+    numbers = max(drives_in(scans), key=lambda one: (len(one) > 1, one[-1:]), default=[])
+    last = len(numbers) - 1 if after is None else after
+    if not 1 <= last < len(numbers):
+        got = f"{drive} with {len(numbers)} scans in a row that have times and poses, and --after {last}"
+        raise DataError(got, "two scans before the first forecast", f"--after 1 to {max(1, len(numbers) - 1)}")
+    motions = [scans[number].motion for number in numbers]
+    times_s = [motion.time_s or 0.0 for motion in motions]
+    known = [motion.pose for motion in motions if motion.pose is not None]  # all of a drive's have one
+    first = max(0, last + 1 - PastTold.past_scans)
+    seen = [Seen(_fine(dataset, numbers[at], sensor), known[at], times_s[at]) for at in range(first, last + 1)]
+    poses = known[: last + 1] if constant_speed else known[: last + 1 + frames]
+    step = torch.linalg.inv(poses[-2]) @ poses[-1]
+    while len(poses) < last + 1 + frames:
+        poses.append(poses[-1] @ step)
+    period_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
+    return Way(seen, poses[last + 1 :], times_s[last] + period_s, period_s)
+
+
+def _fine(dataset: ScanDataset, index: int, sensor: SensorModel) -> Float[Tensor, "H fine_W"]:
+    return project(dataset.scan(index), sensor.fine()).range_m
+
+
+def write_drives(
+    generator: Generator[Any, SamplingT],
+    run_folder: Path,
+    out: Path,
+    ways: Sequence[Way],
+    seeds: Sequence[int],
+    sampling: SamplingT | None = None,
+    **facts: str | int | bool | None,
+) -> int:
+    """Write a sequence of generated scans for each way, at bounded memory; scans that are there are kept.
+
+    A scan is given those written before it, as their files hold them, so that a drive that was stopped goes on to the
+    same files. They lie in ``sequences/SS/velodyne/NNNNNN.bin`` with ``poses.txt``, ``times.txt`` and ``calib.txt``.
+
+    Args:
+        run_folder: folder that the generator was read from.
+        seeds: seed of each drive.
+        facts: entries of the manifest by which the ways are told from others.
+
+    Returns:
+        Number of scans that are there now.
+    """
+    if Past not in generator.takes:
+        got = f"a model of {generator.public_name()!r}, which takes no past"
+        raise ConfigError(got, "a model of drives", "train one: lidargrit train forecaster_compact OUT")
+    settings = generator.Sampling() if sampling is None else sampling
+    names = [f"{drive:02d}/{frame:06d}" for drive, way in enumerate(ways) for frame in range(len(way.poses))]
+    identities = [
+        f"seed {seed}, frame {n}" for seed, way in zip(seeds, ways, strict=True) for n in range(len(way.poses))
+    ]
+    identity = {"source": str(run_folder), **facts, **sampling_identity(generator, run_folder, settings)}
+    folder = ScanFolder(out, MANIFEST, identity, KittiTree(out).files(names), identities)
+    with folder.writing("sampling") as progress:
+        for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
+            moved = [torch.linalg.inv(way.poses[0]) @ pose for pose in way.poses]
+            write_motions(out, f"{drive:02d}", [pose.numpy() for pose in moved], way.period_s)
+            _Drive(generator, way, seed, out / "sequences" / f"{drive:02d}", settings).write(progress)
+    return folder.num_written
+
+
+class _Drive:
+    """Writes the scans of one drive.
+
+    Args:
+        folder: folder of its sequence.
+    """
+
+    def __init__(
+        self, generator: Generator[Any, SamplingT], way: Way, seed: int, folder: Path, sampling: SamplingT
+    ) -> None:
+        self._generator, self._way, self._seed, self._sampling = generator, way, seed, sampling
+        self._files = [folder / "velodyne" / f"{frame:06d}.bin" for frame in range(len(way.poses))]
+
+    def write(self, progress: reporting.Progress) -> None:
+        """Write those scans that are not there."""
+        way, missing = self._way, [not file.exists() for file in self._files]
+        if not any(missing):
+            return
+        begin = max(0, missing.index(True) - PastTold.past_scans)
+        seen = deque([] if begin else way.seen, PastTold.past_scans)
+        for frame in range(begin, len(self._files)):
+            time_s = way.begin_s + frame * way.period_s
+            if missing[frame]:
+                past = self._past(seen, way.poses[frame], time_s)
+                images = self._generator.sample([scan_seed(self._seed, frame)], past, self._sampling)
+                KittiBin.write(self._files[frame], unproject(images[0].to("cpu")))
+                progress.advance(1)
+            seen.append(Seen(self._written(self._files[frame]), way.poses[frame], time_s))
+
+    def _past(self, seen: Sequence[Seen], pose: Pose, time_s: float) -> Condition:
+        if not seen:
+            return NOTHING
+        range_m = torch.stack([one.range_m for one in seen])[None]
+        to_now = torch.linalg.inv(pose)
+        transforms = torch.stack([to_now @ one.pose for one in seen])[None]
+        ages_s = torch.tensor([[time_s - one.time_s for one in seen]], dtype=torch.float64)
+        return Past(range_m, transforms, ages_s, self._generator.sensor)
+
+    def _written(self, file: Path) -> Float[Tensor, "H fine_W"]:
+        image = project(KittiBin.read(file), self._generator.sensor, "spherical")
+        return in_fine_columns(RangeImage.stack([image]))[0]

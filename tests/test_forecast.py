@@ -1,0 +1,108 @@
+"""Drives that are generated scan after scan: the same files when stopped, recorded drives that go on, refusals."""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lidargrit.cli import main
+from lidargrit.core.determinism import scan_seed
+from lidargrit.core.errors import ConfigError, DataError, OutputError
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.drives import write_motions
+from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.generation.generator import load_class
+from lidargrit.inference.drives import continued, path_of, write_drives
+from lidargrit.scans.past import Past
+from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.types import RangeImage
+from test_forecaster import SENSOR, forecaster, street
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    forecaster().save(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> str:
+    """Return a drive of four scans, each half a metre and a little of a turn after the one before."""
+    root = tmp_path_factory.mktemp("recorded")
+    range_m = street(4)
+    for number, image in enumerate(RangeImage(range_m, range_m > 0, SENSOR.fine())[at] for at in range(4)):
+        KittiBin.write(root / "sequences" / "00" / "velodyne" / f"{number:06d}.bin", unproject(image))
+    write_motions(root, "00", [pose.numpy() for pose in way(4)], 0.2)
+    return f"kitti_odometry:{root}:00"
+
+
+@functools.cache
+def way(count: int) -> list[torch.Tensor]:
+    step = torch.eye(4, dtype=torch.float64)
+    step[:2, :2] = torch.tensor([[0.96, -0.28], [0.28, 0.96]])
+    step[0, 3] = 0.5
+    return [torch.linalg.matrix_power(step, number) for number in range(count)]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.bin")}
+
+
+def test_a_drive_that_was_stopped_goes_on_to_the_same_files(run, tmp_path):
+    def write(folder: str, frames: int) -> int:
+        return write_drives(forecaster(), run, tmp_path / folder, [path_of(frames)] * 2, [5, 6], path="straight")
+
+    assert write("whole", 3) == 6
+    assert write("parts", 2) == 4
+    assert write("parts", 3) == 6
+    assert len({*files(tmp_path / "whole").values()}) == 6
+    assert files(tmp_path / "parts") == files(tmp_path / "whole")
+    (tmp_path / "parts" / "sequences" / "01" / "velodyne" / "000001.bin").unlink()
+    write("parts", 3)
+    assert files(tmp_path / "parts") == files(tmp_path / "whole")
+    with pytest.raises(OutputError, match="another 'path'"):
+        write_drives(forecaster(), run, tmp_path / "parts", [path_of(3)] * 2, [5, 6], path="other")
+    assert main(["sample", str(run), str(tmp_path / "verb"), "--frames", "1", "-n", "1", "--seed", "6"]) == 0
+    assert [*files(tmp_path / "verb").values()] == [files(tmp_path / "whole")["sequences/01/velodyne/000000.bin"]]
+    opened = open_dataset(f"kitti_odometry:{tmp_path / 'whole'}:01")
+    assert opened.origin_of(opened.root) == ""
+    motion = opened.motion(2)
+    assert motion.time_s == pytest.approx(0.2)
+    assert motion.pose is not None
+    assert motion.pose[:3, 3].tolist() == pytest.approx([2, 0, 0])
+
+
+def test_a_forecast_is_a_sample_given_the_scans_before_it(run, recorded, tmp_path):
+    words = ["forecast", recorded, str(tmp_path / "out"), "--model", str(run), "-n", "1", "--after", "2", "--seed", "4"]
+    assert main(words) == 0
+    written = KittiBin.read(tmp_path / "out" / "sequences" / "00" / "velodyne" / "000000.bin")
+    dataset = open_dataset(recorded)
+    range_m = torch.stack([project(dataset.scan(at), SENSOR.fine()).range_m for at in range(3)])[None]
+    transforms = torch.stack([torch.linalg.inv(way(4)[3]) @ pose for pose in way(3)])[None]
+    past = Past(range_m, transforms, torch.tensor([[0.6, 0.4, 0.2]], dtype=torch.float64), SENSOR)
+    sampled = forecaster().sample([scan_seed(4, 0)], past)[0]
+    assert torch.equal(written.points_xyz_m, unproject(sampled).points_xyz_m)
+
+
+def test_a_drive_goes_on_by_its_own_poses_or_at_constant_speed(recorded):
+    known = continued(recorded, SENSOR, 3, after=1, constant_speed=False)
+    constant = continued(recorded, SENSOR, 3, after=1, constant_speed=True)
+    for poses in (known.poses, constant.poses):  # all steps are alike there
+        np.testing.assert_allclose(torch.stack([*poses]), torch.stack(way(5)[2:]), atol=1e-6)
+    assert (known.begin_s, known.period_s) == pytest.approx((0.4, 0.2))
+    assert len(known.seen) == 2
+
+
+def test_what_cannot_be_forecast_is_told_in_one_line(run, recorded, tmp_path):
+    with pytest.raises(DataError, match=r"4 scans in a row .* --after 7; wanted two scans before the first forecast"):
+        continued(recorded, SENSOR, 1, after=7, constant_speed=False)
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 5 0 0 0 0 0 1\n")
+    with pytest.raises(ConfigError, match=r"30 scans, 0.1 s apart, along .* which lasts 1.0 s"):
+        path_of(30, tmp_path / "poses.txt")
+    assert float(path_of(11, tmp_path / "poses.txt").poses[10][0, 3]) == pytest.approx(5)
+    multiscale = load_class("multiscale")
+    with pytest.raises(ConfigError, match="'multiscale', which takes no past"):
+        write_drives(multiscale(multiscale.smallest_config(SENSOR), SENSOR), run, tmp_path, [path_of(1)], [0])
