@@ -13,8 +13,11 @@ from lidargrit.core.errors import ConfigError, DataError, OutputError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.drives import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.sources import open_images
+from lidargrit.evaluation.likelihood import score_likelihood
 from lidargrit.generation.generator import load_class
 from lidargrit.inference.drives import continued, path_of, write_drives
+from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.types import RangeImage
@@ -81,10 +84,25 @@ def test_a_forecast_is_a_sample_given_the_scans_before_it(run, recorded, tmp_pat
     written = KittiBin.read(tmp_path / "out" / "sequences" / "00" / "velodyne" / "000000.bin")
     dataset = open_dataset(recorded)
     range_m = torch.stack([project(dataset.scan(at), SENSOR.fine()).range_m for at in range(3)])[None]
-    transforms = torch.stack([torch.linalg.inv(way(4)[3]) @ pose for pose in way(3)])[None]
+    poses = [pose for at in range(4) if (pose := dataset.motion(at).pose) is not None]
+    transforms = torch.stack([transform_between(pose, poses[3]) for pose in poses[:3]])[None]
     past = Past(range_m, transforms, torch.tensor([[0.6, 0.4, 0.2]], dtype=torch.float64), SENSOR)
     sampled = forecaster().sample([scan_seed(4, 0)], past)[0]
     assert torch.equal(written.points_xyz_m, unproject(sampled).points_xyz_m)
+
+
+def test_the_likelihood_of_a_drive_is_the_sum_of_scans_given_their_pasts(recorded):
+    dataset = open_dataset(recorded)
+    fine_m = torch.stack([project(dataset.scan(at), SENSOR.fine()).range_m for at in range(4)])
+    found = score_likelihood(forecaster(), open_images(recorded, SENSOR))
+    for now in range(4):
+        kept_m = fine_m[now : now + 1, :, ::4].contiguous()
+        past = Past.nothing(SENSOR, 1, 1)
+        if now:
+            transforms = torch.stack([torch.linalg.inv(way(4)[now]) @ pose for pose in way(now)])[None]
+            past = Past(fine_m[None, :now], transforms, torch.arange(now, 0, -1).double()[None] / 5, SENSOR)
+        bits = forecaster().bits(RangeImage(kept_m, kept_m > 0, SENSOR), condition=past).total()
+        assert found.parts["mask"][now] + found.parts["range"][now] == pytest.approx(float(bits), rel=1e-4)
 
 
 def test_a_drive_goes_on_by_its_own_poses_or_at_constant_speed(recorded):

@@ -10,19 +10,23 @@ import numpy as np
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import ScanError
+from lidargrit.core.errors import DataError, ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
+from lidargrit.data.pasts import Pasts
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import RunSource, open_source, overlap
 from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
+from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.bits import ScanBits
+from lidargrit.scans.condition import NOTHING
+from lidargrit.scans.past import Past
 from lidargrit.scans.projection.image import told_share
 
 _BATCH = 4
@@ -89,7 +93,7 @@ def _as_text(estimate: Estimate) -> str:
 def score_likelihood(
     generator: Generator, images: RangeImages, step_mm: int = 10, maps: Path | None = None
 ) -> Likelihood:
-    """Return the bits of all images of a set; every scan is coded by itself.
+    """Return the bits of all images of a set; every scan is coded by itself, or given its past in a drive.
 
     Args:
         maps: file to write the bits of every pixel to, float32 (N, H, W) as ``.npy``; none if not given.
@@ -130,8 +134,19 @@ def bits_per_return(generator: Generator, scans: EvalSet) -> float | None:
 def _bits(
     generator: Generator, scans: RangeImages | EvalSet, indices: Sequence[int], step_mm: int
 ) -> Iterator[ScanBits]:
+    pasts = _pasts(generator, scans)
     for first in range(0, len(indices), _BATCH):
-        yield generator.bits(scans.batch(indices[first : first + _BATCH]), step_mm)
+        some = indices[first : first + _BATCH]
+        condition = NOTHING if pasts is None else pasts.of(some)
+        yield generator.bits(scans.batch(some), step_mm, condition=condition)
+
+
+def _pasts(generator: Generator, scans: RangeImages | EvalSet) -> Pasts | None:
+    """Return the pasts of scans of drives for a generator that takes them; None for other scans and generators."""
+    if Past in generator.takes and isinstance(scans, RangeImages):
+        with suppress(DataError):  # of scans that are no drives
+            return Pasts(scans, PastTold.past_scans)
+    return None
 
 
 @contextmanager

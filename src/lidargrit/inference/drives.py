@@ -25,6 +25,7 @@ from lidargrit.generation.generator import Generator, SamplingT
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.scans.condition import NOTHING, Condition
 from lidargrit.scans.fine_columns import in_fine_columns
+from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import SensorModel
@@ -113,7 +114,7 @@ def continued(drive: str, sensor: SensorModel, frames: int, after: int | None, c
     first = max(0, last + 1 - PastTold.past_scans)
     seen = [Seen(_fine(dataset, numbers[at], sensor), known[at], times_s[at]) for at in range(first, last + 1)]
     poses = known[: last + 1] if constant_speed else known[: last + 1 + frames]
-    step = torch.linalg.inv(poses[-2]) @ poses[-1]
+    step = transform_between(poses[-1], poses[-2])
     while len(poses) < last + 1 + frames:
         poses.append(poses[-1] @ step)
     period_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
@@ -158,8 +159,8 @@ def write_drives(
     folder = ScanFolder(out, MANIFEST, identity, KittiTree(out).files(names), identities)
     with folder.writing("sampling") as progress:
         for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
-            moved = [torch.linalg.inv(way.poses[0]) @ pose for pose in way.poses]
-            write_motions(out, f"{drive:02d}", [pose.numpy() for pose in moved], way.period_s)
+            moved = [transform_between(pose, way.poses[0]).numpy() for pose in way.poses]
+            write_motions(out, f"{drive:02d}", moved, way.period_s)
             _Drive(generator, way, seed, out / "sequences" / f"{drive:02d}", settings).write(progress)
     return folder.num_written
 
@@ -197,8 +198,7 @@ class _Drive:
         if not seen:
             return NOTHING
         range_m = torch.stack([one.range_m for one in seen])[None]
-        to_now = torch.linalg.inv(pose)
-        transforms = torch.stack([to_now @ one.pose for one in seen])[None]
+        transforms = torch.stack([transform_between(one.pose, pose) for one in seen])[None]
         ages_s = torch.tensor([[time_s - one.time_s for one in seen]], dtype=torch.float64)
         return Past(range_m, transforms, ages_s, self._generator.sensor)
 

@@ -84,12 +84,16 @@ class ScanFormat(ABC):
     @classmethod
     def can_write(cls) -> bool:
         """Return whether scans can be written in it."""
-        return bool({"write", "write_columns"} & cls.__dict__.keys())
+        return cls._has_its_own("write") or cls.writes_columns()
 
     @classmethod
     def writes_columns(cls) -> bool:
         """Return whether named columns of any points can be written in it."""
-        return "write_columns" in cls.__dict__
+        return cls._has_its_own("write_columns")
+
+    @classmethod
+    def _has_its_own(cls, method: str) -> bool:
+        return any(method in base.__dict__ for base in cls.__mro__[: cls.__mro__.index(ScanFormat)])
 
     @staticmethod
     @abstractmethod

@@ -1,16 +1,15 @@
 """KITTI .bin: float32 rows x, y, z, reflectance ⇄ :class:`Scan`."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from lidargrit.core.errors import ScanError
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, whole_rows, wide_row, write_rows
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, first_bytes, read_bytes, scan_of
+from lidargrit.data.formats.shared.bare_rows import BareRowFormat, columns_by_name, rows_of, whole_rows, wide_row
 from lidargrit.data.formats.shared.carla import right_handed
-from lidargrit.data.formats.shared.filled import marks_file, read_marks
+from lidargrit.data.formats.shared.filled import read_marks
 from lidargrit.scans.types import Scan
 
 _COLUMNS = ("x", "y", "z", "intensity")
@@ -20,7 +19,7 @@ _LEAST_REFLECTANCE = 1e-12  # above 0; bytes of other numbers, such as NCLT's, g
 _FORMAT = "float32 rows x, y, z, reflectance, 16 bytes a point"
 
 
-class KittiBin(ScanFormat):
+class KittiBin(BareRowFormat):
     """Velodyne files as KITTI writes them, little-endian, points in the order in which they were fired.
 
     Source:
@@ -29,6 +28,7 @@ class KittiBin(ScanFormat):
 
     title = "KITTI .bin (float32 x, y, z, reflectance)"
     suffixes = (".bin",)
+    columns = _COLUMNS
     reflectance = "0 to 1, as it is"
     keeps = ("reflectance",)
 
@@ -64,18 +64,8 @@ class KittiBin(ScanFormat):
         )
         return right_handed(scan)
 
-    @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
-        """Return the marks of filled points."""
-        return (marks_file(path),)
-
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
         """Return coordinates and reflectance, 0 if the scan has none."""
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
         return columns_by_name(_COLUMNS, torch.cat((scan.points_xyz_m, reflectance[:, None]), dim=1), scan.filled)
-
-    @classmethod
-    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write rows to a new file, and the marks of filled points beside it."""
-        write_rows(path, _COLUMNS, columns)

@@ -1,6 +1,5 @@
 """nuScenes .pcd.bin: float32 rows x, y, z, intensity, laser of an HDL-32E ⇄ :class:`Scan` with a ring per point."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +7,9 @@ import torch
 from jaxtyping import Float32
 
 from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import columns_by_name, rows_of, whole_rows, write_rows
-from lidargrit.data.formats.shared.filled import marks_file, read_marks
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, first_bytes, read_bytes, scan_of
+from lidargrit.data.formats.shared.bare_rows import BareRowFormat, columns_by_name, rows_of, whole_rows
+from lidargrit.data.formats.shared.filled import read_marks
 from lidargrit.scans.types import Scan
 
 _COLUMNS = ("x", "y", "z", "intensity", "ring")
@@ -21,7 +20,7 @@ _ROWS_TO_LOOK_AT = 4096  # enough to tell laser numbers from coordinates
 _FORMAT = "float32 rows x, y, z, intensity, laser (0 to 31), 20 bytes a point"
 
 
-class NuscenesBin(ScanFormat):
+class NuscenesBin(BareRowFormat):
     """LIDAR_TOP of nuScenes: little-endian, 32 points for each firing, moved to where the car was at the end.
 
     Every beam has a row, also one that did not return: it is stored at the sensor's origin and then moved with the car,
@@ -35,6 +34,7 @@ class NuscenesBin(ScanFormat):
 
     title = "nuScenes .pcd.bin (float32 x, y, z, intensity, laser)"
     suffixes = (".pcd.bin",)
+    columns = _COLUMNS
     reflectance = "intensity 0 to 255, divided by 255"
     frame = "x right, y forward, z up"
     sensor = "hdl32e"
@@ -70,11 +70,6 @@ class NuscenesBin(ScanFormat):
             rows=rows_of(_COLUMNS, rows, far),
         )
 
-    @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
-        """Return the marks of filled points."""
-        return (marks_file(path),)
-
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
         """Return the columns of a scan of 32 rings in the axes of the file, intensity 0 if it has no reflectance."""
@@ -88,11 +83,6 @@ class NuscenesBin(ScanFormat):
         reflectance = torch.zeros(len(scan)) if scan.reflectance is None else scan.reflectance
         rows = torch.stack((-y, x, z, (255 * reflectance).round(), (_LASERS - 1 - scan.ring).float()), dim=1)
         return columns_by_name(_COLUMNS, rows, scan.filled)
-
-    @classmethod
-    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write rows to a new file, and the marks of filled points beside it."""
-        write_rows(path, _COLUMNS, columns)
 
 
 def _are_lasers(numbers: Float32[np.ndarray, "n"]) -> bool:

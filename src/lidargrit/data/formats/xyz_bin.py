@@ -1,14 +1,13 @@
 """float32 rows x, y, z without reflectance, also named .bin ⇄ :class:`Scan`."""
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
 from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
-from lidargrit.data.formats.shared.bare_rows import columns_by_name, row_width, rows_of, whole_rows, write_rows
-from lidargrit.data.formats.shared.filled import marks_file, read_marks
+from lidargrit.data.formats import POINTS_AT_MOST, BadPoints, first_bytes, read_bytes, scan_of
+from lidargrit.data.formats.shared.bare_rows import BareRowFormat, columns_by_name, row_width, rows_of, whole_rows
+from lidargrit.data.formats.shared.filled import read_marks
 from lidargrit.scans.types import Scan
 
 _COLUMNS = ("x", "y", "z")
@@ -18,7 +17,7 @@ _FARTHEST_M = 1000.0  # no lidar of a car sees farther; bytes that are no coordi
 _FORMAT = "float32 rows x, y, z, 12 bytes a point"
 
 
-class XyzBin(ScanFormat):
+class XyzBin(BareRowFormat):
     """Bare coordinates, little-endian, as some programs write KITTI's scans.
 
     Such a file is told from KITTI's, which has the same ending, by its content: after as many values as a point has, a
@@ -27,6 +26,7 @@ class XyzBin(ScanFormat):
 
     title = "bare .bin (float32 x, y, z)"
     suffixes = (".bin",)
+    columns = _COLUMNS
     reflectance = "none"
     keeps = ()
 
@@ -51,11 +51,6 @@ class XyzBin(ScanFormat):
         marks = read_marks(path, len(rows))
         return scan_of(rows, None, None, str(path), bad_points, filled=marks, rows=rows_of(_COLUMNS, rows))
 
-    @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
-        """Return the marks of filled points."""
-        return (marks_file(path),)
-
     @classmethod
     def columns_of(cls, scan: Scan) -> dict[str, np.ndarray]:
         """Return the coordinates of a scan."""
@@ -64,8 +59,3 @@ class XyzBin(ScanFormat):
             what = f"a coordinate of {farthest_m:g} m in {scan.source}, to write as {cls.title}"
             raise OutputError(what, f"at most {_FARTHEST_M:g} m", "choose another format, such as ply")
         return columns_by_name(_COLUMNS, scan.points_xyz_m, scan.filled)
-
-    @classmethod
-    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write rows to a new file, and the marks of filled points beside it."""
-        write_rows(path, _COLUMNS, columns)

@@ -2,14 +2,15 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.presets import PIXEL_DECODER, PIXELS, STREETS, preset
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.generation.presets import PIXEL_DECODER, PIXELS, preset
 from lidargrit.systems.forecaster.system import ForecasterConfig
 
 PRESETS = {
-    # Drives have to be simulated first: lidargrit simulate drives -n 2000 --frames 12
+    # Drives are simulated first: lidargrit simulate drives -n 2000 --frames 12, and drives_val with --seed 1000000
     "forecaster_compact": preset(
         "the next scan of a drive: 64x256, for one CPU core and two hours",
-        replace(STREETS, train=("kitti_odometry:drives:all",), condition="past"),
+        DataConfig(("kitti_odometry:drives:all",), ("kitti_odometry:drives_val:all",), condition="past"),
         ForecasterConfig(replace(PIXEL_DECODER, mask_features=12, coarse_range_width=48, decoded_components=True)),
         pixels=replace(
             PIXELS,

@@ -52,7 +52,10 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
 
     Config = ForecasterConfig
     trains = (("pixels", "pixels", "past"),)
-    facts = SystemFacts(generates="range and raydrop of the next scan of a drive, given its past scans and poses")
+    facts = SystemFacts(
+        generates="range and raydrop of the next scan of a drive, given its past scans and poses",
+        first_command="sample RUN drives -n 1 --frames 20",
+    )
     Sampling = PixelSampling
     capabilities = frozenset({"likelihood"})
 

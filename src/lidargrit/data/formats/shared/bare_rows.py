@@ -2,15 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Shaped
+from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
-from lidargrit.data.formats.shared.filled import write_marks
+from lidargrit.data.formats import ScanFormat
+from lidargrit.data.formats.shared.filled import marks_file, write_marks
 from lidargrit.scans.file_rows import FileRows
 
 _WIDTHS = range(3, 9)  # x, y, z to x, y, z, intensity, ring, time and two more
@@ -20,6 +22,29 @@ _FEW_NUMBERS, _WIDTHS_OF_FEW = 1024, range(3, 6)  # fewer do not show wider rows
 # sensor fire by turns (0.51, VLP-16): then both points of a pair lie in one direction.
 _FAR_MORE = 0.9
 _ONE_DIRECTION = 0.95  # mean cosine between azimuths; 0.997 to 1 for pairs of points, below 0.7 for other columns
+
+
+class BareRowFormat(ScanFormat):
+    """Files of float32 rows without a header, little-endian, with the marks of filled points beside them.
+
+    Attributes:
+        columns: names of the numbers of a row.
+    """
+
+    columns: ClassVar[tuple[str, ...]]
+
+    @staticmethod
+    def companions(path: Path) -> tuple[Path, ...]:
+        """Return the marks of filled points."""
+        return (marks_file(path),)
+
+    @classmethod
+    def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
+        """Write rows to a new file, and the marks of filled points beside it."""
+        rows = np.stack([columns[name] for name in cls.columns], axis=1).astype("<f4")
+        write_marks(path, columns.get("filled"))
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(rows.tobytes())
 
 
 def row_width(values: Float32[np.ndarray, "n"]) -> int:
@@ -72,14 +97,6 @@ def rows_of(names: Sequence[str], rows: Float32[Tensor, "N w"], kept: Bool[Tenso
     """Return the rows of a file, of which those that are kept are the points of a scan; all if not given."""
     every = torch.arange(len(rows))
     return FileRows(columns_by_name(names, rows), (every if kept is None else every[kept]).numpy())
-
-
-def write_rows(path: Path, names: Sequence[str], columns: Mapping[str, Shaped[np.ndarray, "n"]]) -> None:
-    """Write columns as rows of little-endian numbers, and the marks of filled points beside them."""
-    rows = np.stack([columns[name] for name in names], axis=1).astype("<f4")
-    write_marks(path, columns.get("filled"))
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(rows.tobytes())
 
 
 def _mean_difference(values: Float32[np.ndarray, "n"], step: int) -> float:
