@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_completion(parser: argparse.ArgumentParser, model: str, points_only: bool = False) -> None:
     """Add the options of all three verbs: source, folder, ``model``, number and kind of files."""
-    parser.set_defaults(goes_on=True)
+    parser.set_defaults(goes_on=True, ray="")
     images = ", samples, prepared scans, or range images as .npy"
     scans = f"scans: a file, a folder, NAME:ROOT:SPLIT{' of points' if points_only else images}"
     parser.add_argument("scans", help=scans)
@@ -76,7 +76,8 @@ def run_task(options: argparse.Namespace, model: "Model", task: "Task", probabil
 
     output = OutputConfig(options.samples, options.seed, options.format, probability)
     config = scan_settings(options, max_scans=options.count).data
-    found = complete_scans(options.scans, options.out, model, task, output, config)
+    where = {"ray": options.ray, "device": options.device}
+    found = complete_scans(options.scans, options.out, model, task, output, config, **where)
     print(f"done: {counted_scans(found.scans)} in {options.out}{_points(found, task)}")
     print(look_at(options.out))
 

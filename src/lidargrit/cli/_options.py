@@ -98,7 +98,7 @@ def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
 
 def add_ray(parser: argparse.ArgumentParser) -> None:
     """Add ``--ray``, for work that the machines of a cluster share."""
-    address = "Ray cluster that does the work: auto, HOST:PORT or ray://HOST:PORT"
+    address = "Ray cluster that does the work: auto or HOST:PORT"
     parser.add_argument("--ray", default="", metavar="ADDRESS", help=address)
 
 
