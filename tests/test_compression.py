@@ -18,7 +18,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.inference.compress import rounding
-from lidargrit.inference.compress.archive import writing
+from lidargrit.inference.compress.archive import add_scan, writing
 from lidargrit.inference.compress.rounding import exp, ln, sigmoid
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.nn.transformer import TransformerConfig
@@ -167,8 +167,8 @@ def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp
     ):
         path.unlink(missing_ok=True)
         with writing(path, {"step_mm": 20}) as writer:
-            for name in names:
-                writer.add(name, name, b"a", 1)
+            for number, name in enumerate(names):
+                add_scan(writer.folder, number, (name, name, 1), b"a")
         assert main(["decompress", str(path), str(tmp_path / "out")]) == 2
         assert message in the_one_line(capsys.readouterr().err, "decompress")
         assert [one.name for one in tmp_path.iterdir()] == ["scans.lgz"]

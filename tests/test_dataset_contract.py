@@ -12,7 +12,7 @@ from lidargrit.scans.projection import project
 from lidargrit.scans.sensors import load_sensor
 
 NAMES = discovery.names("datasets")
-READ_ONLY = {"ouster", "pandaset"}
+READ_ONLY = {"ncore", "ouster", "pandaset", "py123d"}
 ROOT = Path("4")  # a folder for those that read files, a count for the simulated one
 
 

@@ -4,6 +4,7 @@ The library is large, so these tests run where it is installed, in an environmen
 first are skipped.
 """
 
+import json
 import os
 import re
 import signal
@@ -121,6 +122,49 @@ def test_a_cluster_writes_what_one_process_writes(cluster, streets, tmp_path, ca
     assert contents(tmp_path / "here") == contents(tmp_path / "there")
     assert main([*samples[:2], str(tmp_path / "none"), "--set", "sampling.x=1", "--ray", cluster.address]) == 2
     assert "got" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_cluster_completes_and_tells_what_it_leaves_out_as_one_process_does(cluster, streets, tmp_path, capsys):
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for file in sorted((streets[1] / "tree").glob("sequences/*/velodyne/*.bin"))[:4]:
+        (scans / file.name).write_bytes(file.read_bytes())
+    (scans / "000009.bin").write_bytes(b"cut")
+    words = ["--sensor", SENSOR, "--model", "nearest", "--bad-scans", "skip"]
+    told = []
+    for where in ("here", "there"):
+        out = tmp_path / "out"  # which files name
+        ray = ["--ray", cluster.address] if where == "there" else []
+        assert main(["complete", str(scans), str(out), *words, *ray]) == 0
+        told.append({line for line in capsys.readouterr().err.splitlines() if line.startswith("left out: ")})
+        out.rename(tmp_path / where)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
+    assert len(told[0]) == 1
+    assert told[0] == told[1]
+
+
+def test_a_cluster_scores_as_one_process_does(cluster, tmp_path):
+    words = ["evaluate", f"simulated:4@{SENSOR}", f"simulated:4@{SENSOR}:val", "--metrics", "bev_jsd", "bev_mmd"]
+    found = []
+    for ray in ([], ["--ray", cluster.address]):
+        scores = tmp_path / f"scores{len(ray)}.json"
+        assert main([*words, "--groups", "4", "--json", str(scores), *ray]) == 0
+        card = json.loads(scores.read_text())
+        found.append({"scores": [{**score, "seconds": 0} for score in card.pop("scores")], **card, "sha256": ""})
+    assert found[0] == found[1]
+    assert main([*words[:3], "--protocol", "streets", "--ray", cluster.address]) == 2
+
+
+def test_a_cluster_completes_and_compresses_samples_as_one_process_does(cluster, tmp_path):
+    samples, out = tmp_path / "samples", tmp_path / "out"
+    assert main(["sample", "pretrained", str(samples), "-n", "2"]) == 0
+    for where, ray in (("here", []), ("there", ["--ray", cluster.address])):
+        out.mkdir()
+        filled = ["complete", str(samples), str(out / "filled"), "--observed", "rows:4", "--format", "image"]
+        assert main([*filled, *ray]) == 0
+        assert main(["compress", str(samples), str(out / "scans.lgz"), *ray]) == 0
+        out.rename(tmp_path / where)
+    assert contents(tmp_path / "here") == contents(tmp_path / "there")
 
 
 @pytest.mark.parametrize("dies", ["worker", "node"])

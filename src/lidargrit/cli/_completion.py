@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_completion(parser: argparse.ArgumentParser, model: str, points_only: bool = False) -> None:
     """Add the options of all three verbs: source, folder, ``model``, number and kind of files."""
-    parser.set_defaults(goes_on=True)
+    parser.set_defaults(goes_on=True, ray="")
     images = ", samples, prepared scans, or range images as .npy"
     scans = f"scans: a file, a folder, NAME:ROOT:SPLIT{' of points' if points_only else images}"
     parser.add_argument("scans", help=scans)
@@ -57,15 +57,15 @@ def named_sensor(options: argparse.Namespace, is_needed: bool, job: "Job" = "com
     """Return the sensor that the user named, else that of the source, which is told if guessed.
 
     Args:
-        is_needed: whether the model has no sensor of its own; a run has, which does ``job``, and refuses another.
+        is_needed: whether the model has no sensor of its own; a run has, which does ``job``, and refuses another unless
+            it takes any.
     """
     from lidargrit.data.sources import open_source
-    from lidargrit.data.sources.scan_sensor import refuse_other_sensor, sensor_for
+    from lidargrit.data.sources.scan_sensor import sensor_for, sensor_for_run
 
     settings = scan_settings(options)
     if not is_needed:
-        refuse_other_sensor(settings, options.model, job)
-        return None
+        return sensor_for_run(settings, options.scans, options.model, job)
     source = open_source(options.scans, settings.data.bad_points)
     return settings.data.imaged(sensor_for(source, settings.sensor))
 
@@ -76,7 +76,8 @@ def run_task(options: argparse.Namespace, model: "Model", task: "Task", probabil
 
     output = OutputConfig(options.samples, options.seed, options.format, probability)
     config = scan_settings(options, max_scans=options.count).data
-    found = complete_scans(options.scans, options.out, model, task, output, config)
+    where = {"ray": options.ray, "device": options.device}
+    found = complete_scans(options.scans, options.out, model, task, output, config, **where)
     print(f"done: {counted_scans(found.scans)} in {options.out}{_points(found, task)}")
     print(look_at(options.out))
 

@@ -40,9 +40,9 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
         raise ConfigError(f"--report with {sets[1]}, which holds no scan", "scans to show", "leave it out")
     streets = streets_of(options.samples, config) if options.reference and not sets[1].endswith(ENDING) else None
     if streets is None:
-        refuse_unused(options, "without --protocol streets", (*_OF_BOTH, *_OF_CARDS))
+        refuse_unused(options, "without --protocol streets", ("ray", *_OF_BOTH, *_OF_CARDS))
         refuse_to_overwrite(options.report, options.overwrite, ".html")
-        card, pair = compare_sources(*sets, config)
+        card, pair = compare_sources(*sets, config, options.ray)
         report = partial(write_report, card, pair, options.report) if options.report else None
         return card.as_table(), card.to_json(), report
     refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model", "beside"))

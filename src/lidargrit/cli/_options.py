@@ -9,6 +9,7 @@ from lidargrit.core.untrusted import whole_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
+    from lidargrit.scans.sensors import SensorModel
 
 SCANS = ("sensor", "projection", "bad_points", "bad_scans", "set")
 """Names of the options of :func:`add_scans`."""
@@ -66,6 +67,20 @@ def sampling_words(words: Sequence[str]) -> list[str]:
     return [word.removeprefix("sampling.") for word in words if word.startswith("sampling.")]
 
 
+def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
+    """Return the sensor whose scans are to be sampled, with the columns of ``--set``; None for a run's own.
+
+    A cluster samples single scans of a run's own sensor alone.
+    """
+    from lidargrit.data.prepared.config import ScanSettings
+
+    for word in ("sensor", "frames"):
+        if options.ray and getattr(options, word):
+            raise ConfigError(f"--{word} {getattr(options, word)} with --ray", "one of them", "leave --ray out")
+    words = [word for word in options.set if word.startswith("data.")]
+    return ScanSettings.read(words, sensor=options.sensor).load_sensor()
+
+
 def add_count(
     parser: argparse.ArgumentParser, default: int = 0, help: str = "number of scans, evenly spaced; 0 for all"
 ) -> None:
@@ -83,7 +98,7 @@ def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
 
 def add_ray(parser: argparse.ArgumentParser) -> None:
     """Add ``--ray``, for work that the machines of a cluster share."""
-    address = "Ray cluster that does the work: auto, HOST:PORT or ray://HOST:PORT"
+    address = "Ray cluster that does the work: auto or HOST:PORT"
     parser.add_argument("--ray", default="", metavar="ADDRESS", help=address)
 
 

@@ -3,6 +3,7 @@
 import argparse
 
 from lidargrit.cli._completion import add_completion, named_sensor, open_model_for, run_task
+from lidargrit.cli._options import add_ray
 
 EXAMPLES = """\
   lidargrit complete /data/scans whole                             fill in every ray without a point
@@ -17,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     observed += "ahead), pixels:SHARE (a random share), or an .npy of truth values, one for each pixel"
     parser.add_argument("--observed", default="returns", help=observed)
     add_completion(parser, "run that completes, or nearest, linear or triangulation")
+    add_ray(parser)
 
 
 def run(options: argparse.Namespace) -> None:

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_count, add_scans, scan_settings
+from lidargrit.cli._options import add_count, add_ray, add_scans, scan_settings
 from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
@@ -22,18 +22,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
     add_count(parser)
     add_scans(parser)
+    add_ray(parser)
     add("--overwrite", action="store_true", help="replace the file if it exists")
 
 
 def run(options: argparse.Namespace) -> None:
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.sources.scan_sensor import refuse_other_sensor
+    from lidargrit.data.sources.scan_sensor import sensor_for_run
     from lidargrit.inference.compress.command import compress_scans
 
     refuse_to_overwrite(options.out, options.overwrite, ".lgz")
     named = (options.scans, options.out, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
-    refuse_other_sensor(settings, options.model)
-    found = compress_scans(*named, settings.data)
+    sensor = sensor_for_run(settings, options.scans, options.model)
+    found = compress_scans(*named, settings.data, options.ray, sensor)
     size = f"{found.num_bytes:,} bytes, {found.bits_per_return:.2f} bits a return in steps of {options.step_mm} mm"
     print(f"done: {counted_scans(found.num_scans)} in {options.out}: {size}")

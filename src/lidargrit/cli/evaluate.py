@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._evaluation import evaluated
-from lidargrit.cli._options import add_count, add_device, add_scans
+from lidargrit.cli._options import add_count, add_device, add_ray, add_scans
 from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
 from lidargrit.core.untrusted import seed_number
 
@@ -31,10 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
     add_count(parser, help="largest number of scans; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="half-samples for 95 %% intervals; 0 for none")
-    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which a model has to beat")
+    add("--pixel-statistics", action="store_true", help="also score pixel statistics, which models must beat")
     add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples")
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
     add_device(parser)
+    add_ray(parser)
     add_scans(parser)
     add("--model", default="", metavar="RUN", help="model of raydrop (streets) or of drives (forecast)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")

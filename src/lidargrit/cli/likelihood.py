@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.data.sources.scan_sensor import refuse_other_sensor
+    from lidargrit.data.sources.scan_sensor import sensor_for_run
     from lidargrit.evaluation.likelihood import measure_source
 
     refuse_taken(options)
@@ -36,5 +36,5 @@ def run(options: argparse.Namespace) -> None:
         refuse_to_overwrite(options.map, options.overwrite, ".npy")
     named = (options.scans, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
-    refuse_other_sensor(settings, options.model)
-    print_result(options, *measure_source(*named, settings.data, options.map, options.device))
+    sensor = sensor_for_run(settings, options.scans, options.model)
+    print_result(options, *measure_source(*named, settings.data, options.map, options.device, sensor))

@@ -4,15 +4,15 @@ import argparse
 import os
 from pathlib import Path
 
-from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words
+from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words, sensor_of
 from lidargrit.cli._results import look_at
-from lidargrit.core.errors import ConfigError, counted_scans
+from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, seeds_in_a_row, whole_number
 
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
+  lidargrit sample runs/any mine --sensor mine.json       by a run of the preset multiscale_any
   lidargrit sample runs/forecaster drives -n 2 --frames 100 --path poses.txt           two drives of ten seconds
-  torchrun --no-python --nproc-per-node 8 lidargrit sample runs/demo many -n 100000       one process a GPU
 """
 
 
@@ -22,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
     parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
+    parser.add_argument("--sensor", default="", help="name or .json of another sensor, for a run that takes any")
     parser.add_argument("--frames", type=whole_number, default=0, metavar="N", help="scans in a row of each drive")
     parser.add_argument("--path", type=Path, help="poses of a drive: TUM's rows, or a KITTI sequence (else straight)")
     add_settings(parser, "settings of sampling, such as sampling.temperature=1.1; see: lidargrit list generators")
@@ -41,9 +42,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.nn.devices import usable_device
 
     seeds = seeds_in_a_row(options.seed, options.count)
-    address, words = ray_address(options), sampling_words(options.set)
-    if address and options.frames:
-        raise ConfigError("--frames with --ray", "one of them", "leave --ray out")
+    address, words, sensor = ray_address(options), sampling_words(options.set), sensor_of(options)
     if address:
         write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
@@ -51,6 +50,7 @@ def run(options: argparse.Namespace) -> None:
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
         device, run_folder = usable_device(options.device or own), locate(options.run_folder)
         generator, seeds = load(run_folder).to(device), seeds[rank::world_size]
+        generator = generator.for_sensor(sensor or generator.sensor)
         sampling = generator.parse_sampling(words)
         if options.frames:
             ways = [path_of(options.frames, options.path)] * len(seeds)

@@ -49,6 +49,10 @@ class DataError(LidarGritError):
     """A folder or a data source is not what was asked for."""
 
 
+class ClusterError(DataError):
+    """Workers of a cluster died; the same command goes on."""
+
+
 class UnknownNameError(LidarGritError):
     """No sensor, preset, metric, ... of that name."""
 

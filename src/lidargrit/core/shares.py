@@ -7,19 +7,23 @@ the command itself may die at any time, and the same share is done again by anot
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import urlsplit
 
-from lidargrit.core.errors import DataError, LidarGritError, first_words
+from lidargrit.core import reporting
+from lidargrit.core.errors import ClusterError, DataError, LidarGritError, first_words
 from lidargrit.core.processes import process_pool
 
 if TYPE_CHECKING:
     from types import ModuleType
 
 Share = TypeVar("Share")
+Result = TypeVar("Result")
 
 _RETRIES = 3  # of a share whose worker or machine died; the same command takes up what failed more often
 _ANSWERS_WITHIN_S = 5.0
@@ -28,12 +32,12 @@ _CLUSTER = "a Ray cluster: auto on one of its machines, HOST:PORT, or ray://HOST
 
 
 def each_done(
-    do: Callable[[Share], int], shares: Sequence[Share], workers: int = 1, ray: str = "", on_gpus: bool = False
-) -> Iterator[int]:
+    do: Callable[[Share], Result], shares: Sequence[Share], workers: int = 1, ray: str = "", on_gpus: bool = False
+) -> Iterator[Result]:
     """Do every share, and yield what each returned when it is done, in any order.
 
     Args:
-        do: function of a module that does one share and may be repeated; it returns the number of scans.
+        do: function of a module that does one share and may be repeated; what it reports is heard here.
         workers: number of processes on this machine.
         ray: address of a Ray cluster that does it instead, whose machines see the same folders at the same paths.
         on_gpus: whether a share takes a GPU of its own, where the cluster has some.
@@ -50,8 +54,30 @@ def each_done(
             yield from pool.map(do, shares)
 
 
-def _by_ray(do: Callable[[Share], int], shares: Sequence[Share], address: str, on_gpus: bool) -> Iterator[int]:
-    ray = _connected(address)
+@contextmanager
+def connected(address: str) -> "Iterator[None]":
+    """Keep one connection to a Ray cluster for all that :func:`each_done` does in the block; none without an address.
+
+    Raises:
+        LidarGritError: no cluster answers.
+    """
+    if not address:
+        yield
+        return
+    ray = _connect(address)
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _by_ray(do: Callable[[Share], Result], shares: Sequence[Share], address: str, on_gpus: bool) -> Iterator[Result]:
+    ray = sys.modules.get("ray")
+    if ray is None or not ray.is_initialized():
+        with connected(address):
+            yield from _by_ray(do, shares, address, on_gpus)
+        return
+    heard = set[str]()
     try:
         needs = {"num_gpus": 1} if on_gpus and ray.cluster_resources().get("GPU") else {}
         task = ray.remote(num_cpus=1, max_retries=_RETRIES, **needs)(_done_in)
@@ -59,7 +85,12 @@ def _by_ray(do: Callable[[Share], int], shares: Sequence[Share], address: str, o
         waiting = [task.remote(here, sent, share) for share in shares]
         while waiting:
             done, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=_LOOK_EVERY_S)
-            yield from ray.get(done)
+            for result, told in ray.get(done):
+                for text in dict.fromkeys(told):
+                    if text not in heard:  # what a command says once, each worker says
+                        reporting.message(text)
+                heard.update(told)
+                yield result
     except ray.exceptions.RayTaskError as error:
         if isinstance(error.cause, LidarGritError):
             raise error.cause from None
@@ -69,22 +100,37 @@ def _by_ray(do: Callable[[Share], int], shares: Sequence[Share], address: str, o
         raise
     except ray.exceptions.RayError as error:
         cure = "look for what ended it, such as a lack of memory; the same command goes on"
-        raise DataError(f"a worker of the cluster that died ({first_words(error)})", "all to end well", cure) from None
-    finally:
-        ray.shutdown()
+        raise ClusterError(
+            f"a worker of the cluster that died ({first_words(error)})", "all to end well", cure
+        ) from None
 
 
-def _done_in(folder: str, do: Callable[[Share], int], share: Share) -> int:
-    """Do a share on a machine of the cluster, in the folder from which the command was given: paths may start there."""
+class _Notes(reporting.Reporter):
+    """Keeps what is reported."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def message(self, text: str) -> None:
+        self.told.append(text)
+
+
+def _done_in(folder: str, do: Callable[[Share], Result], share: Share) -> tuple[Result, list[str]]:
+    """Do a share on a machine of the cluster, in the folder from which the command was given: paths may start there.
+
+    Returns:
+        what it returned, and what it reported.
+    """
     try:
         os.chdir(folder)
     except OSError as error:
         got = f"{folder}, which {socket.gethostname()} of the cluster cannot enter ({error.strerror})"
         raise DataError(got, "a folder that all its machines share", "give the command from such a folder") from None
-    return do(share)
+    with reporting.to(notes := _Notes()):
+        return do(share), notes.told
 
 
-def _connected(address: str) -> "ModuleType":
+def _connect(address: str) -> "ModuleType":
     """Connect to a cluster, and return the library."""
     if address != "auto":
         _refuse_silent(address)

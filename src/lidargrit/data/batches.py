@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import torch
+from jaxtyping import Int64
+from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed
 from lidargrit.core.errors import ConfigError
@@ -23,8 +25,11 @@ _AHEAD = 8  # batches that wait beyond those that are being read: enough for no 
 class Batches:
     """Training batches as a function of the scans seen so far: a resumed run sees the same as one that ran through.
 
+    A batch holds images of one sensor.
+
     Args:
-        images: range images to learn from; each comes once an epoch, in an order that the seed determines.
+        images: range images to learn from; each comes once an epoch, in an order that the seed determines. Of images of
+            several sensors, those are left out of an epoch that fill no batch.
         batch_size: number of scans in a batch, over all processes.
         augmentations: kinds of augmentation, applied in this order.
         any_columns: whether an image may begin at any fine column; see :class:`TrainingConfig`.
@@ -61,6 +66,13 @@ class Batches:
         self.workers, self._condition_of, self._with_keys = workers, condition_of, with_keys
         self._pasts = Pasts(images, past_scans) if past_scans else None
         self._epoch, self._order = -1, torch.empty(0)
+        self._by_sensor = images.alike(range(len(images)), len(images))
+        self._epoch_length = len(images)
+        if len(self._by_sensor) > 1:
+            self._epoch_length = sum(len(each) // batch_size * batch_size for each in self._by_sensor)
+            if not self._epoch_length:
+                got = f"batch_size={batch_size}, and fewer scans of each of {len(self._by_sensor)} sensors"
+                raise ConfigError(got, "a batch of one sensor", "lower batch_size, or take more scans of each")
 
     def stream(self, scans_seen: int, until: int) -> Iterator[Example]:
         """Yield the batches from ``scans_seen`` scans on, up to the last that begins before ``until`` scans."""
@@ -90,7 +102,8 @@ class Batches:
     def _read(self, indices: list[int], seeds: list[int]) -> Example:
         # Each scan has its own random numbers, so that it looks the same however many processes share a batch.
         rngs = [torch.Generator().manual_seed(seed) for seed in seeds]
-        columns = [int(torch.randint(self.images.sensor.column_stride, (1,), generator=rng)) for rng in rngs]
+        stride = self.images.sensor_of(indices[0]).column_stride
+        columns = [int(torch.randint(stride, (1,), generator=rng)) for rng in rngs]
         first_columns = columns if self.any_columns else None
         images, past = self.images.batch(indices, first_columns), None
         if self._pasts is not None:
@@ -106,8 +119,18 @@ class Batches:
         return example.with_keys() if self._with_keys else example
 
     def _scan_at(self, position: int) -> int:
-        epoch, index = divmod(position, len(self.images))
+        epoch, index = divmod(position, self._epoch_length)
         if epoch != self._epoch:
             rng = torch.Generator().manual_seed(derive_seed(self.seed, 0, epoch))
-            self._epoch, self._order = epoch, torch.randperm(len(self.images), generator=rng)
+            self._epoch, self._order = epoch, self._ordered(rng)
         return int(self._order[index])
+
+    def _ordered(self, rng: torch.Generator) -> Int64[Tensor, " n"]:
+        """Return the images of an epoch: in any order, or of several sensors in batches in any order."""
+        if len(self._by_sensor) == 1:
+            return torch.randperm(len(self.images), generator=rng)
+        batches: list[Tensor] = []
+        for each in self._by_sensor:
+            shuffled = torch.tensor(each)[torch.randperm(len(each), generator=rng)]
+            batches += [some for some in shuffled.split(self.batch_size) if len(some) == self.batch_size]
+        return torch.cat([batches[number] for number in torch.randperm(len(batches), generator=rng).tolist()])

@@ -100,21 +100,50 @@ class TimedStore(Protocol):
 
 
 class RangeImages:
-    """Range images of one sensor, in one or more stores, numbered through.
+    """Range images in one or more stores, numbered through, of one sensor unless sets of several are joined.
 
     Args:
+        sensor: sensor of the images; of several, that of the first.
         stores: sources of images that are as wide as the sensor's, or that have all of its fine columns.
     """
 
     def __init__(self, sensor: SensorModel, stores: Sequence[ImageStore]) -> None:
         self.sensor = sensor
         self._stores = [store for store in stores if len(store)]
+        self._sensors = [sensor] * len(self._stores)
         self._ends = list(accumulate(len(store) for store in self._stores))
 
     @classmethod
-    def joined(cls, sensor: SensorModel, parts: "Sequence[RangeImages]") -> "RangeImages":
-        """Join the images of several sets into one set, in their order."""
-        return cls(sensor, [store for part in parts for store in part._stores])
+    def joined(cls, sensor: SensorModel | None, parts: "Sequence[RangeImages]") -> "RangeImages":
+        """Join the images of several sets into one set, in their order.
+
+        Args:
+            sensor: sensor of all of them; None where each set keeps its own.
+        """
+        found = cls(sensor or parts[0].sensor, [store for part in parts for store in part._stores])
+        if sensor is None:
+            found._sensors = [each for part in parts for each in part._sensors]
+        return found
+
+    def sensor_of(self, index: int) -> SensorModel:
+        """Return the sensor of an image."""
+        return self._sensors[bisect_right(self._ends, index)]
+
+    def alike(self, indices: Sequence[int], at_most: int) -> list[list[int]]:
+        """Divide indices into batches, in their order, of images of one sensor each.
+
+        Args:
+            at_most: largest number of images of a batch.
+        """
+        batches: list[list[int]] = []
+        for index in indices:
+            if not batches or len(batches[-1]) == at_most or not self._same_sensor(batches[-1][0], index):
+                batches.append([])
+            batches[-1].append(index)
+        return batches
+
+    def _same_sensor(self, one: int, other: int) -> bool:
+        return self.sensor_of(one) is self.sensor_of(other)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -149,7 +178,7 @@ class RangeImages:
         return frozenset.intersection(*(_first_planes(store) for store in self._stores))
 
     def batch(self, indices: Sequence[int], first_columns: Sequence[int] | None = None) -> RangeImage:
-        """Return some images as one batch (B, H, W).
+        """Return some images of one sensor as one batch (B, H, W).
 
         Args:
             indices: numbers of the images.
@@ -163,7 +192,7 @@ class RangeImages:
             name: torch.from_numpy(np.stack([one.planes[name] for one in pixels]).astype(PLANES[name].dtype))
             for name in sorted(self._planes)
         }
-        return RangeImage(range_m, range_m > 0, self.sensor, planes)
+        return RangeImage(range_m, range_m > 0, self.sensor_of(indices[0]) if indices else self.sensor, planes)
 
     def _pixels(self, index: int, first_column: int) -> Pixels:
         part = bisect_right(self._ends, index)
@@ -173,10 +202,11 @@ class RangeImages:
             names = store.provenance.names
             got = f"{names[number] if names else f'image {number}'} without {' and '.join(sorted(lacking))}"
             raise DataError(got, "what the first image beside it has", "remove it, or make all of them alike")
-        if whole.range_m.shape[1] < self.sensor.width:
+        width = self._sensors[part].width
+        if whole.range_m.shape[1] < width:
             got = f"images of {whole.range_m.shape[1]} columns"
-            raise DataError(got, f"all {self.sensor.width} fine columns", "name the scans that they were made of")
-        kept = slice(first_column, None, whole.range_m.shape[1] // self.sensor.width)
+            raise DataError(got, f"all {width} fine columns", "name the scans that they were made of")
+        kept = slice(first_column, None, whole.range_m.shape[1] // width)
         return Pixels(whole.range_m[:, kept], {name: whole.planes[name][:, kept] for name in self._planes})
 
 

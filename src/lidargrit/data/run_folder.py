@@ -110,6 +110,11 @@ def read_config(folder: Path) -> SavedConfig:
             raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
 
 
+def takes_any_sensor(folder: Path) -> bool:
+    """Return whether the networks of a finished run are told of a sensor's rays; its own is then but one of many."""
+    return is_run(folder) and configuration.leaves(read_config(folder).config).get("pixels.any_sensor") is True
+
+
 @contextmanager
 def told_of(path: Path) -> Iterator[None]:
     """Turn what the ``with`` block meets in a file of settings into a CheckpointError that names the file."""

@@ -109,7 +109,15 @@ class ScanFolder:
             if self._bad_scans == "refuse":
                 raise
             reporting.message(f"left out: {error}")
-            self._left_out.update(self.files[index] for index in indices)
+            self.leave_out(indices)
+
+    def leave_out(self, indices: Sequence[int]) -> None:
+        """Leave files out."""
+        self._left_out.update(self.files[index] for index in indices)
+
+    def is_left_out(self, index: int) -> bool:
+        """Return whether a file is left out."""
+        return self.files[index] in self._left_out
 
     def tell_labels_lost(self, file: str) -> None:
         """Tell, the first time, that a file by its ending keeps no labels."""

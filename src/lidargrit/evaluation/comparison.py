@@ -3,12 +3,14 @@
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from lidargrit.core import discovery, reporting
 from lidargrit.core.errors import ConfigError, LidarGritError, nearest_names, one_of
+from lidargrit.core.shares import connected
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
 from lidargrit.core.version import __version__, source_sha256
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
@@ -19,7 +21,7 @@ from lidargrit.evaluation.pairs import EvalPair, Opened, pair_for_protocol
 from lidargrit.evaluation.protocols import DEFAULT, MetricChoice, Protocol, load_protocol, public_name
 from lidargrit.evaluation.reference_file import FiledSet, ReferenceFile, reference_file, write_reference
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
-from lidargrit.evaluation.scoring import MetricFactory, keep_real, score_metrics
+from lidargrit.evaluation.scoring import Cluster, MetricFactory, keep_real, score_metrics
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -51,7 +53,7 @@ class EvalConfig:
     max_scans: int = 0
     seed: int = 0
     resampling: Resampling = field(default_factory=Resampling)
-    weights: Mapping[str, Path] = field(default_factory=dict)
+    weights: Mapping[str, Path] = field(default_factory=dict, hash=False)
     pixel_statistics: bool = False
     samples_format: str = ""
     device: str = "cpu"
@@ -164,13 +166,16 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def compare_sources(samples: str, reference: str, settings: EvalConfig | None = None) -> tuple[Scorecard, EvalPair]:
+def compare_sources(
+    samples: str, reference: str, settings: EvalConfig | None = None, ray: str = ""
+) -> tuple[Scorecard, EvalPair]:
     """Score a folder of samples, or any source of scans, against another.
 
     Args:
         samples: name of a folder of samples, of ours or of another program, or of any source of scans.
         reference: name of the second set; its scans are projected with the sensor of the samples.
         settings: protocol and its changes.
+        ray: address of a Ray cluster that feeds the metrics; see :func:`each_done`.
 
     Raises:
         ConfigError: the two sets look along different rays, or a setting is out of its bounds.
@@ -192,10 +197,19 @@ def compare_sources(samples: str, reference: str, settings: EvalConfig | None = 
         )
     _refuse_unused(first, settings)
     pair = open_pair(first, second, settings)
-    card = compare_pair(pair, settings)
+    with connected(ray):
+        there = Cluster(ray, partial(_pair_of, samples, reference, settings), settings.device != "cpu")
+        card = compare_pair(pair, settings, there if ray else None)
     for warning in card.warnings[len(pair.warnings) :]:
         reporting.message(f"WARNING: {warning}")
     return card, pair
+
+
+@lru_cache(maxsize=1)  # for all groups that a worker feeds
+def _pair_of(samples: str, reference: str, settings: EvalConfig) -> EvalPair:
+    first = open_source(samples, settings.data.bad_points, settings.samples_format)
+    with reporting.to(reporting.Reporter()):  # the command has told all warnings
+        return open_pair(first, open_reference(reference, settings), settings)
 
 
 def open_reference(text: str, settings: EvalConfig) -> Source | ReferenceFile:
@@ -252,8 +266,8 @@ def save_reference(scans: str, path: Path, settings: EvalConfig) -> ReferenceFil
     return write_reference(path, by, opened, real, both, settings.resampling, keep_all=bool(settings.metrics))
 
 
-def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
-    """Score two opened sets.
+def compare_pair(pair: EvalPair, settings: EvalConfig, cluster: Cluster | None = None) -> Scorecard:
+    """Score two opened sets, by a cluster if one is given.
 
     Raises:
         LidarGritError: not one metric could be computed; the reason of the first.
@@ -263,7 +277,7 @@ def compare_pair(pair: EvalPair, settings: EvalConfig) -> Scorecard:
     factories = [metric_factory(choice, settings) for choice in wanted]
     file = pair.reference.file if isinstance(pair.reference, FiledSet) else None
     kept = [file.kept(factory) for factory in factories] if file else []
-    found = score_metrics(factories, pair, settings.resampling, settings.pixel_statistics, kept)
+    found = score_metrics(factories, pair, settings.resampling, settings.pixel_statistics, kept, cluster)
     scores = [score for score in found if isinstance(score, Score)]
     errors = [error for error in found if isinstance(error, LidarGritError)]
     left_out = [

@@ -28,6 +28,7 @@ from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection.image import told_share
+from lidargrit.scans.sensors import SensorModel
 
 _BATCH = 4
 _COMPARED_AT_MOST = 64  # scans: enough to tell systems apart, and seconds where all would take minutes
@@ -164,13 +165,20 @@ def _maps(path: Path | None, size: tuple[int, int, int]) -> Iterator[BinaryIO | 
 
 
 def measure_source(
-    text: str, model: str, step_mm: int, config: DataConfig, maps: Path | None = None, device: str = ""
+    text: str,
+    model: str,
+    step_mm: int,
+    config: DataConfig,
+    maps: Path | None = None,
+    device: str = "",
+    sensor: SensorModel | None = None,
 ) -> tuple[str, dict[str, Any]]:
     """Measure the scans of a source by a finished run: their bits, and the errors of their reconstructions.
 
     Args:
         model: finished run; scans are projected with its sensor, in the way of its training.
         maps: file to write the bits of every pixel to; none if not given.
+        sensor: sensor of the scans, for a run that takes any; the run's own if not given.
 
     Returns:
         tables for people, and the same as plain values: bits of a model that has probabilities, errors of one with
@@ -179,9 +187,10 @@ def measure_source(
     run = RunSource(model, locate(model))
     config = run.as_projected(config)
     generator = load(locate(model)).to(usable_device(device))
+    generator = generator if sensor is None else generator.for_sensor(sensor)
     has_tokens = "tokens" in generator.capabilities
     source = open_source(text, config.bad_points)
-    images = source.images(run.sensor, config)
+    images = source.images(generator.sensor, config)
     if source.has_points:
         with suppress(ScanError):  # of a first scan that was left out, and told of
             reporting.message(told_share(images.batch([0])[0], len(source.scans().scan(0))))

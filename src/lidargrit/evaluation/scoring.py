@@ -12,7 +12,8 @@ import torch
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
-from lidargrit.core.errors import DataError, LidarGritError, ScanError
+from lidargrit.core.errors import ClusterError, DataError, LidarGritError, ScanError
+from lidargrit.core.shares import each_done
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.metrics import Metric, WholeImages, load_metric, update_together
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
@@ -40,6 +41,21 @@ class MetricFactory:
         if cls.needs_weights:
             options |= {"weights": self.weights, "device": self.device}
         return cls(**options)
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """A Ray cluster that feeds metrics, a group of scans a task.
+
+    Args:
+        ray: address of the cluster; see :func:`each_done`.
+        open_pair: function that opens the two sets on one of its machines.
+        on_gpus: whether a task takes a GPU.
+    """
+
+    ray: str
+    open_pair: Callable[[], EvalPair]
+    on_gpus: bool = False
 
 
 @dataclass(eq=False)
@@ -91,6 +107,7 @@ def score_metrics(
     resampling: Resampling,
     with_pixel_statistics: bool = False,
     kept: Sequence[KeptOfReal | LidarGritError] = (),
+    cluster: Cluster | None = None,
 ) -> list[Score | LidarGritError]:
     """Score two sets by several metrics.
 
@@ -100,6 +117,7 @@ def score_metrics(
     Args:
         with_pixel_statistics: whether each score gets that of pixel statistics, if there are four scans or more.
         kept: state of each metric after the real scans, or an error, where these are not here themselves; else empty.
+        cluster: cluster that feeds the metrics; not given, this process does.
 
     Returns:
         the score of each metric, or why it could not be computed: no weights, no reflectance, too few scans.
@@ -108,9 +126,9 @@ def score_metrics(
     def scored(indices: list[int], advance: Callable[[int], None]) -> list[Score | LidarGritError]:
         begun_s = time.perf_counter()
         some = [factories[index] for index in indices]
-        generated = _fed(some, pair.samples, False, resampling, advance)
+        generated = _fed(some, pair.samples, False, resampling, advance, cluster)
         of_real = [each for index in indices if isinstance(each := kept[index], KeptOfReal)] if kept else []
-        of_real = of_real or _keep_real(some, pair.reference, resampling, with_pixel_statistics, advance)
+        of_real = of_real or _keep_real(some, pair.reference, resampling, with_pixel_statistics, advance, cluster)
         feeding_s = (time.perf_counter() - begun_s) / len(some)
         sizes = [len(group) for group in _groups(pair.samples, resampling)]
         found: list[Score | LidarGritError] = []
@@ -167,7 +185,7 @@ def _together(
             note = ", ".join(factories[index].choice.metric for index in indices)
             try:
                 found |= zip(indices, found_by(indices, partial(progress.advance, note=note)), strict=True)
-            except ScanError:
+            except (ScanError, ClusterError):
                 raise
             except LidarGritError as error:
                 found |= dict.fromkeys(indices, error)
@@ -184,6 +202,7 @@ def _fed(
     real: bool,
     resampling: Resampling,
     advance: Callable[[int], None],
+    cluster: Cluster | None,
 ) -> list[list[Part]]:
     """Feed a set to metrics that share features, group by group.
 
@@ -192,18 +211,43 @@ def _fed(
         that were fed these as generated ones.
     """
     sides = [real, False] if real and resampling.halves else [real]
-    found: list[list[Part]] = [[] for _ in range(len(sides) * len(factories))]
-    for group in _groups(images, resampling):
-        metrics = [(factory(), side) for side in sides for factory in factories]
-        for metric, _ in metrics:
-            metric.first_image = group.start
-        for first in range(0, len(group), _BATCH):
-            batch = images.batch(group[first : first + _BATCH])
-            update_together(metrics, batch)
-            advance(len(factories) * len(batch))
-        for parts, (metric, _) in zip(found, metrics, strict=True):
-            parts.append(Part(metric))
-    return found
+    groups = _groups(images, resampling)
+    by_group: dict[range, list[Part]] = {}
+    if cluster is None:
+        for group in groups:
+            by_group[group] = _feed(factories, images, sides, group, advance)
+    else:
+        do = partial(_feed_there, cluster.open_pair, factories, sides)
+        for group, parts in each_done(do, groups, ray=cluster.ray, on_gpus=cluster.on_gpus):
+            by_group[group] = parts
+            advance(len(factories) * len(group))
+    return [[by_group[group][number] for group in groups] for number in range(len(sides) * len(factories))]
+
+
+def _feed(
+    factories: Sequence[MetricFactory],
+    images: EvalSet,
+    sides: Sequence[bool],
+    group: range,
+    advance: Callable[[int], None],
+) -> list[Part]:
+    """Feed one group of a set to new metrics, for each side one of each factory."""
+    metrics = [(factory(), side) for side in sides for factory in factories]
+    for metric, _ in metrics:
+        metric.first_image = group.start
+    for first in range(0, len(group), _BATCH):
+        batch = images.batch(group[first : first + _BATCH])
+        update_together(metrics, batch)
+        advance(len(factories) * len(batch))
+    return [Part(metric) for metric, _ in metrics]
+
+
+def _feed_there(
+    open_pair: Callable[[], EvalPair], factories: Sequence[MetricFactory], sides: Sequence[bool], group: range
+) -> tuple[range, list[Part]]:
+    """Feed one group on a machine of a cluster; of the two sets it is the real one if the first side is."""
+    pair = open_pair()
+    return group, _feed(factories, pair.reference if sides[0] else pair.samples, sides, group, lambda _: None)
 
 
 def _keep_real(
@@ -212,9 +256,10 @@ def _keep_real(
     resampling: Resampling,
     with_pixel_statistics: bool,
     advance: Callable[[int], None],
+    cluster: Cluster | None = None,
 ) -> list[KeptOfReal]:
     count = len(factories)
-    parts = _fed(factories, reference, True, resampling, advance)
+    parts = _fed(factories, reference, True, resampling, advance, cluster)
     as_generated = parts[count:] or [[] for _ in factories]
     found = [KeptOfReal(*each) for each in zip(parts[:count], as_generated, strict=True)]
     if with_pixel_statistics:

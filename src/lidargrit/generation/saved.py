@@ -74,6 +74,20 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         """Return the name of the folder in which ``system.py`` defines the class."""
         return cls.__module__.removesuffix(".system").rpartition(".")[2]
 
+    def for_sensor(self, sensor: SensorModel) -> Self:
+        """Return the network with the same weights for the scans of another sensor; itself for its own rays.
+
+        Raises:
+            ConfigError: a sensor that it does not take, with those that it takes.
+        """
+        if not self.sensor.same_rays(sensor):
+            raise ConfigError(
+                f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for {self.public_name()!r}",
+                f"its own, {self.sensor.name!r}, {self.sensor.height}x{self.sensor.width}",
+                "name a run of that sensor, or train the preset multiscale_any, which takes any",
+            )
+        return self
+
     def weights(self, bits: WeightBits = 32) -> dict[str, Tensor]:
         """Return the tensors that are saved, by name.
 

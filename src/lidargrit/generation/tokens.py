@@ -291,10 +291,11 @@ class PixelObjective(Objective):
         In training some phases of each scan stand for all; in validation all are counted.
         """
         images, decoded = example.images, self.decoded(example, rng)
+        pixels = self.pixels.for_sensor(images.sensor)
         if self.training:
-            mask_nats, range_nats = self.pixels.estimate(decoded, images, rng)
+            mask_nats, range_nats = pixels.estimate(decoded, images, rng)
         else:
-            nll = self.pixels(decoded, images)
+            nll = pixels(decoded, images)
             mask_nats, range_nats = nll.mask.mean(), nll.range.sum() / images.return_mask.sum().clamp(min=1)
         bits = {"mask_bits": mask_nats / math.log(2), "range_bits": nats_to_range_bits(range_nats)}
         return {"loss": mask_nats + range_nats, **{name: value.detach() for name, value in bits.items()}}

@@ -189,15 +189,16 @@ class StageTraining:
         totals: dict[str, float] = {}
         # As many at once as a process has in a step, since more may not fit in memory.
         at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))
-        for first in range(0, len(chosen), at_once):
+        first = 0
+        for indices in images.alike(chosen, at_once):
             if termination is not None and self.engine.any(termination.asked):
                 raise Terminated
-            indices = chosen[first : first + at_once]
             batch = images.batch(indices)
             example = Example(batch, self.condition.of(batch) if pasts is None else pasts.of(indices))
             terms = self.engine.evaluate(self.average.objective, example, derive_seed(self.seed, 3, first))
             for name, value in terms.items():
                 totals[name] = totals.get(name, 0.0) + value * len(indices) / len(chosen)
+            first += len(indices)
         return totals
 
     def _step(self, example: Example) -> dict[str, Tensor]:

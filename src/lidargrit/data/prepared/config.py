@@ -22,6 +22,8 @@ class DataConfig(Settings):
         sensor: name of a sensor, or path of a sensor's ``.json`` file.
         columns: number of fine columns over the whole circle; 0 for the sensor's own number.
         column_stride: step between the fine columns that an image keeps, such as 8 for every eighth.
+        own_sensors: whether each source of training or validation scans keeps its own sensor and its columns, for a
+            model of any sensor; ``sensor`` and ``columns`` are then those of the scans that it samples.
         projection: ``spherical`` (rows by elevation), ``unfolding`` (rows by ring), or ``sensor`` for the sensor's own.
         projection_variant: ``exact``; ``reference`` repeats the projection of LidarGRIT's program, ``clamped`` that of
             R2DM's, LiDARGen's and LiDARCrafter's.
@@ -37,6 +39,7 @@ class DataConfig(Settings):
     sensor: str = "hdl64e_kitti_odometry"
     columns: NotNegative = 0
     column_stride: Count = 1
+    own_sensors: bool = False
     projection: ProjectionOption = "sensor"
     projection_variant: ProjectionVariant = "exact"
     condition: str = "nothing"

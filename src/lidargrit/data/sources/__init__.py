@@ -265,6 +265,8 @@ def joined_images(
     sensor: SensorModel | None = None,
 ) -> RangeImages:
     """Return the range images of sources that :func:`open_to_train` has opened as one set."""
+    if config.own_sensors:
+        return RangeImages.joined(None, [source.images(source.sensor, config) for source in opened])
     sensor = sensor or config.load_sensor()
     return RangeImages.joined(sensor, [source.images(sensor, config) for source in opened])
 

@@ -5,8 +5,8 @@ import shlex
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import ScanSettings
-from lidargrit.data.run_folder import Job, locate
-from lidargrit.data.sources import RunSource
+from lidargrit.data.run_folder import Job, locate, takes_any_sensor
+from lidargrit.data.sources import RunSource, open_source
 from lidargrit.data.sources.source import Source
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
@@ -14,6 +14,19 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 def sensor_for(source: Source, name: str) -> SensorModel:
     """Return the sensor of a name or a ``.json`` file, else that of a source."""
     return load_sensor(name) if name else source.sensor
+
+
+def sensor_for_run(settings: ScanSettings, scans: str, model: str, job: Job = "sample") -> SensorModel | None:
+    """Return the sensor of scans for a run that takes any: the named one, else that of their source, which is told.
+
+    Args:
+        scans: source of the scans.
+        model: run; of one that knows its own sensor alone, None is returned, and another is refused.
+    """
+    if not takes_any_sensor(locate(model, job)):
+        refuse_other_sensor(settings, model, job)
+        return None
+    return settings.data.imaged(sensor_for(open_source(scans, settings.data.bad_points), settings.sensor))
 
 
 def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample") -> None:

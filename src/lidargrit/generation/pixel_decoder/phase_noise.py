@@ -18,6 +18,8 @@ _PRIOR = 10.0  # as if about a hundred uncertain pairs had been seen without any
 _MOST = 0.9  # of the noise that is shared; the rest decides each pixel alone
 _OF_NEXT_COLUMN = 0.6  # correlation with the numbers of the column before, where a scan is several images
 _LEAST = 1e-6  # of a probability, so that its quantile is finite
+ROW_RAD, COLUMN_RAD = math.radians(0.42), 2 * math.pi / 256
+"""Distances of rows and columns at which noise of any sensor decays as that of its own pixels does."""
 
 
 class PhaseNoise(nn.Module):
@@ -29,15 +31,20 @@ class PhaseNoise(nn.Module):
     common, and one that pixels beside one another have; the common ones decay with the distance. The shares are learned
     in training, from how the residuals of neighbours in one phase correlate.
 
+    Args:
+        phases: all phases of the pixel decoder.
+        places: place of every row, and distance of two columns, in rows and columns of a typical sensor, by which the
+            noise decays; one for each row and column if not given.
+
     Source:
         Sklar's theorem for the copula; Kibble, An extension of a theorem of Mehler's on Hermite polynomials, 1945.
     """
 
     sums: Tensor
 
-    def __init__(self, phases: Sequence[Phase]) -> None:
+    def __init__(self, phases: Sequence[Phase], places: tuple[Sequence[float], float] | None = None) -> None:
         super().__init__()
-        self.phases = tuple(phases)
+        self.phases, self._given = tuple(phases), places
         # For each phase and direction (down, along the row): residuals' products, then the series' coefficients.
         self.register_buffer("sums", torch.zeros(len(phases), 2, 1 + _TERMS))
 
@@ -59,12 +66,34 @@ class PhaseNoise(nn.Module):
             pairs.append((factors, factors.roll(-1, -1)))
         first = self.phases.index(phases[0])
         for direction, (one, other) in enumerate(pairs):
-            some = seen[first : first + len(phases), direction]
-            some[:, :-1] = (one * other).sum((2, 3, 4)).T
+            some, products = seen[first : first + len(phases), direction], one * other
+            if self._given is not None:
+                products = products * self._nearness(phases, direction, products)
+            some[:, :-1] = products.sum((2, 3, 4)).T
             some[:, -1] = logits.shape[1]
         seen, scans = sum_over_processes(seen).split((1 + _TERMS, 1), -1)  # which may each have taken other phases
         kept = 0.5 ** ((seen[:, :, 1:2] > 0) * (scans / _HALF_LIFE_SCANS))
         self.sums.mul_(kept).add_(seen)
+
+    def _nearness(
+        self, phases: Sequence[Phase], direction: int, products: Float64[Tensor, "F P B h w"]
+    ) -> Float64[Tensor, "F P 1 #h 1"]:
+        """Return by how much each term of the covariance of neighbours is larger than at the typical distance."""
+        rows = products.shape[3] + (direction == 0)
+        apart = [
+            torch.tensor(self._places(phase, (rows, 2))[direction], dtype=torch.float64).diff() for phase in phases
+        ]
+        nearness = _REACH ** (torch.stack(apart).abs().to(products.device) - 1)
+        powers = torch.arange(len(products), device=products.device)[:, None, None]  # the residuals have none
+        return (nearness**powers)[:, :, None, :, None]
+
+    def _places(self, phase: Phase, size: tuple[int, int]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the places of a phase's rows and columns, in steps from one to the next of a typical sensor."""
+        if self._given is None:
+            return tuple(map(float, range(size[0]))), tuple(map(float, range(size[1])))
+        rows, step = self._given
+        of_rows = tuple(row / (2 * phase.lattice.rows) for row in rows[phase.pixels[0]])
+        return of_rows, tuple(step * column for column in range(size[1]))
 
     def correlations(self) -> Float64[Tensor, "phases 2"]:
         """Return the correlation of a pixel's normal number with that of the next of its phase, down and along."""
@@ -102,10 +131,10 @@ class PhaseNoise(nn.Module):
         normal = torch.special.ndtri(uniform.double().clamp(_LEAST, 1 - _LEAST))
         for phase, (down, along) in zip(self.phases, shares.tolist(), strict=True):
             own, rows, columns = normal[phase.pixels], shared[0][phase.pixels], shared[1][phase.pixels]
-            height, width = own.shape
+            of_rows, of_columns = self._places(phase, (own.shape[0], own.shape[1]))
             mixed = math.sqrt(1 - down - along) * own
-            mixed = mixed + math.sqrt(down) * (_root(height, wraps=False) @ rows)
-            normal[phase.pixels] = mixed + math.sqrt(along) * (columns @ _root(width, wraps=True).T)
+            mixed = mixed + math.sqrt(down) * (_root(of_rows) @ rows)
+            normal[phase.pixels] = mixed + math.sqrt(along) * (columns @ _root(of_columns, wraps=True).T)
         return torch.special.ndtr(normal).to(uniform.dtype).clamp(max=1 - torch.finfo(uniform.dtype).eps)
 
 
@@ -146,9 +175,15 @@ def _hermite_factors(logits: Float64[Tensor, "*P"], returned: Bool[Tensor, "*P"]
 
 
 @lru_cache(maxsize=64)
-def _root(count: int, wraps: bool) -> Float64[Tensor, "n n"]:
-    """Return the Cholesky factor of correlations that decay with the distance, on a line or around a circle."""
-    apart = (torch.arange(count)[:, None] - torch.arange(count)).abs()
+def _root(places: tuple[float, ...], wraps: bool = False) -> Float64[Tensor, "n n"]:
+    """Return the Cholesky factor of correlations that decay with the distance, on a line or around a circle.
+
+    Args:
+        places: places of the pixels; around a circle they are equally far apart.
+    """
+    at = torch.tensor(places, dtype=torch.float64)
+    apart = (at[:, None] - at).abs()
     if wraps:
-        apart = torch.minimum(apart, count - apart)
-    return torch.linalg.cholesky(_REACH ** apart.double())
+        step = places[1] - places[0] if len(places) > 1 else 1
+        apart = torch.minimum(apart, len(places) * step - apart)
+    return torch.linalg.cholesky(_REACH**apart)

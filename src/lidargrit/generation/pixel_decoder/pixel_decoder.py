@@ -23,6 +23,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     one_of_phases,
 )
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
+from lidargrit.generation.pixel_decoder.ray_encoding import with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
@@ -38,6 +39,8 @@ _Guided = tuple[
 _ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so many pixels, or fewer
 
 _NOISE_AT_MOST = 1e6  # beyond, the components' scales have no finite numbers; with 100 all ranges are noise already
+
+_SENSORS_KEPT = 256  # whose rows are encoded, and whose surfaces are known
 
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
@@ -103,19 +106,33 @@ class PixelDecoder(nn.Module):
         self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1, gaps: bool = False
     ) -> None:
         super().__init__()
-        rows, columns = (
-            config.coarsest_cell * 2**halvings for halvings in (config.row_halvings, config.column_halvings)
-        )
-        if sensor.height % rows or sensor.width % columns:
-            raise ConfigError(
-                f"range images of {sensor.height}x{sensor.width} for a pixel decoder of cells of {rows}x{columns}",
-                "cells that divide both sides",
-                "lower coarsest_cell, column_halvings or row_halvings, or choose another number of columns",
-            )
-        self.config, self.sensor = config, sensor
-        self.mask = MaskNetwork(config, sensor, features)
+        if not config.any_sensor:
+            _check_size(config, sensor)
+        self.config, self.sensor, self._sizes = config, sensor, (features, components, gaps)
+        self._others: dict[SensorModel, PixelDecoder] = {}
+        self.grid = with_absent_rows(sensor) if config.any_sensor else sensor
+        self.mask = MaskNetwork(config, self.grid, features, sensor.height)
         decoded = components if config.decoded_components and features else 0
-        self.range = RangeNetwork(config, sensor, features, decoded, gaps)
+        self.range = RangeNetwork(config, self.grid, features, decoded, gaps, sensor.height)
+
+    def for_sensor(self, sensor: SensorModel) -> "PixelDecoder":
+        """Return the decoder of another sensor's images with the very same weights: what one learns the other knows.
+
+        A decoder that is not for any sensor returns itself. What is computed of a sensor's rays is kept.
+        """
+        if not self.config.any_sensor or sensor is self.sensor:
+            return self
+        device, found = self.mask.before.device, self._others.get(sensor)
+        if found is None or found.mask.before.device != device:
+            with torch.random.fork_rng(devices=[]):  # the weights that it begins with are not used
+                found = PixelDecoder(self.config, sensor, *self._sizes).to(device)
+            for name, weight in self.state_dict(keep_vars=True).items():
+                module, _, last = name.rpartition(".")
+                setattr(found.get_submodule(module), last, weight)
+            if len(self._others) >= _SENSORS_KEPT:
+                del self._others[next(iter(self._others))]
+            self._others[sensor] = found
+        return found.train(self.training)
 
     def forward(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
         """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.
@@ -125,7 +142,7 @@ class PixelDecoder(nn.Module):
             images: range images, rounded to the steps if there are any.
             steps: steps whose probability is the likelihood of a range; without them it is a density per metre.
         """
-        guide = self.guide(decoded, len(images))
+        guide, images = self.guide(decoded, len(images)), self._whole(images)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nll, range_nll = None, None  # of the pixels of a lattice, from the coarsest to the whole image
         for phases in self.mask.by_lattice():
@@ -133,15 +150,15 @@ class PixelDecoder(nn.Module):
             mask_nll, range_nll = join_phases(mask_nll, of_mask), join_phases(range_nll, of_range)
         assert mask_nll is not None
         assert range_nll is not None
-        return PixelNll(mask_nll, range_nll)
+        return PixelNll(mask_nll[:, : self.sensor.height], range_nll[:, : self.sensor.height])
 
     def guide(self, decoded: Decoded | None, count: int) -> Guide:
         """Return the inputs of the networks for every pixel of a number of scans before the first phase."""
-        return Guide.nothing(self.mask.rows, count, self.sensor) if decoded is None else Guide.of(decoded)
+        return Guide.nothing(self.mask.before, count, self.grid) if decoded is None else Guide.of(decoded)
 
     def expected(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps) -> PixelNll:
         """Return the expected value of :meth:`forward` for each pixel (its entropy), given the earlier ones."""
-        guide = self.guide(decoded, len(images))
+        guide, images = self.guide(decoded, len(images)), self._whole(images)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask, v = images.return_mask, images.range_m.log1p()
         mask_nats, range_nats = None, None
@@ -153,7 +170,12 @@ class PixelDecoder(nn.Module):
             range_nats = join_phases(range_nats, torch.where(at_phases(mask, phases), entropy, 0.0))
         assert mask_nats is not None
         assert range_nats is not None
-        return PixelNll(mask_nats, range_nats)
+        return PixelNll(mask_nats[:, : self.sensor.height], range_nats[:, : self.sensor.height])
+
+    def _whole(self, images: RangeImage) -> RangeImage:
+        """Return images with the absent rows, in which nothing returns."""
+        absent = self.grid.height - self.sensor.height
+        return images.mapped(lambda pixels: F.pad(pixels, (0, 0, 0, absent)), self.grid) if absent else images
 
     def bits(
         self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps, expected: bool
@@ -176,6 +198,7 @@ class PixelDecoder(nn.Module):
         Of a fine lattice one phase counts for all: a step costs a third to a half, and there are as many more steps.
         Coarse lattices have few pixels to learn from, and all their phases count. The estimate of the mask is unbiased.
         """
+        pixels, images = images.range_m.numel(), self._whole(images)
         guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
@@ -189,7 +212,7 @@ class PixelDecoder(nn.Module):
             returns = returns + share * at_phases(images.return_mask, chosen).sum()
         if self.training:  # as many returns as one process with the whole batch would divide by, for each process
             returns = mean_over_processes(returns)
-        return mask_nats / guide.v.numel(), range_nats / returns.clamp(min=1)
+        return mask_nats / pixels, range_nats / returns.clamp(min=1)
 
     @property
     def num_evaluations(self) -> int:
@@ -231,7 +254,7 @@ class PixelDecoder(nn.Module):
             condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
                 are when their phase comes: later phases know of them, earlier ones do not.
         """
-        guide, size = self.guide(decoded, len(rngs)), (3, self.sensor.height, self.sensor.width)
+        guide, size = self.guide(decoded, len(rngs)), (3, self.grid.height, self.grid.width)
         choices = sampling or PixelSampling()
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs])
         shares = self.mask.noise.shares(choices.mask_correlation)
@@ -240,6 +263,10 @@ class PixelDecoder(nn.Module):
         device = guide.v.device
         uniform = uniform.to(device)
         condition = condition.to(device) if condition else Observed.nothing(self.sensor, len(rngs), device)
+        if absent := self.grid.height - self.sensor.height:
+            maps = condition.range_m, condition.range_observed, condition.return_mask, condition.return_observed
+            range_m, range_observed, mask, observed = (F.pad(each, (0, 0, 0, absent)) for each in maps)
+            condition = Observed(range_m, range_observed, mask, observed, self.grid)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if device.type == "cpu" else len(uniform)
         images = []
@@ -250,7 +277,9 @@ class PixelDecoder(nn.Module):
                 mask = self.mask.sample(some, uniform[part, 0], condition[part])
                 range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], choices)
             reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
-            images.append(RangeImage.masked(range_m, mask, self.sensor, planes_of(reflectance=reflectance)))
+            own = slice(self.sensor.height)
+            planes = planes_of(reflectance=reflectance)
+            images.append(RangeImage.masked(range_m[:, own], mask[:, own], self.sensor, planes))
         return RangeImage.cat(images)
 
     def _sample_range(
@@ -268,6 +297,8 @@ class PixelDecoder(nn.Module):
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
             mixture = self.range.distributions([phase], guided, guide, mask, v)
+            if self.config.any_sensor and temperature != 1:
+                mixture = mixture.without_last()  # which is any range at all
             # Of every pixel, though some are observed and some do not return: the host need not know which.
             component, within = uniform[pixels][None].unbind(2)
             sampled = mixture.sample(component, within, temperature, sampling.range_noise)[0]
@@ -275,6 +306,17 @@ class PixelDecoder(nn.Module):
             range_m[pixels] = found.where(mask[pixels], 0.0)
             v[pixels] = range_m[pixels].log1p()
         return range_m
+
+
+def _check_size(config: PixelDecoderConfig, sensor: SensorModel) -> None:
+    """Refuse images that the cells of one sensor do not divide."""
+    rows, columns = (config.coarsest_cell * 2**halvings for halvings in (config.row_halvings, config.column_halvings))
+    if sensor.height % rows or sensor.width % columns:
+        raise ConfigError(
+            f"range images of {sensor.height}x{sensor.width} for a pixel decoder of cells of {rows}x{columns}",
+            "cells that divide both sides",
+            "lower coarsest_cell, column_halvings or row_halvings, or choose another number of columns",
+        )
 
 
 def nats_to_range_bits(nats: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:

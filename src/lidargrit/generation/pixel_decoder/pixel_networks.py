@@ -1,5 +1,6 @@
 """The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -13,7 +14,8 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
-from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise, following
+from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
+from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise, following
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,
@@ -24,47 +26,18 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     one_of_phases,
     phases_of,
 )
-from lidargrit.nn.blocks import Network
-from lidargrit.nn.convolution import Convolution, Residual
+from lidargrit.generation.pixel_decoder.ray_encoding import RowEncoding, coarsest_cell_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.random import rngs_of
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
 
-
-class LatticeNetwork(Network):
-    """The network of all phases of one lattice, over cells of 2x2 pixels of the lattice.
-
-    The part of the first layer that sees the guide is computed once for all phases.
-    """
-
-    def __init__(self, guide: int, context: int, width: int, blocks: int, phases: int, outputs: int) -> None:
-        super().__init__()
-        self.guide, self.context = Convolution(guide, width, "wrap"), Convolution(context, width, "wrap")
-        self.phase_bias = nn.Parameter(torch.zeros(phases, width))
-        self.blocks = nn.Sequential(*(Residual(width) for _ in range(blocks)))
-        self.out = nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases))
-        for layer in self.out:
-            nn.init.zeros_(layer.get_parameter("weight"))
-            nn.init.zeros_(layer.get_parameter("bias"))
-
-    def forward(
-        self, guided: Float[Tensor, "B C h w"], contexts: Float[Tensor, "P B D h w"], first: int
-    ) -> Float[Tensor, "P B O h w"]:
-        """Return the outputs of as many phases as there are contexts, from the phase ``first`` on."""
-        size = contexts.shape[:2]
-        x = self.context(contexts.flatten(0, 1)).unflatten(0, size)
-        x = x + guided + self.phase_bias[first : first + size[0], None, :, None, None]
-        x = F.silu(self.blocks(x.flatten(0, 1))).unflatten(0, size)
-        outputs = [layer(part) for layer, part in zip(self.out[first:], x, strict=False)]
-        return at_least_32_bits(torch.stack(outputs))
-
-
 LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good as sure
 _HALVINGS_AT_MOST = 8  # of one side alone
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _DECODED_LOG_SCALE_M = -3.0  # 5 cm
+_NEVER = -60.0  # logit of a return in rows that a sensor does not have
 
 
 @dataclass(frozen=True)
@@ -94,6 +67,9 @@ class PixelDecoderConfig(Settings):
             assume that the sensor is level.
         decoded_components: whether more components are those of the range's distribution that the tokenizer decodes,
             or one at its decoded range where it decodes no distribution; they are corrected as the mask's logits are.
+        any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
+            are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
+            largest, and smaller images begin with smaller cells.
         range_temperature: temperature at which ranges are sampled where the caller names none. What suits a model
             depends on its columns and its training: choose it by samples against validation scans.
     """
@@ -111,11 +87,26 @@ class PixelDecoderConfig(Settings):
     surface_components: bool = False
     gravity_components: bool = False
     decoded_components: bool = False
+    any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
 
     def __post_init__(self) -> None:
         super().__post_init__()
         phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
+        if self.any_sensor and (self.column_halvings or self.row_halvings):
+            got = f"any_sensor with column_halvings={self.column_halvings} and row_halvings={self.row_halvings}"
+            raise ConfigError(got, "square cells, which all sensors share", "leave them out, or any_sensor")
+
+    def phases(self, sensor: SensorModel) -> list[Phase]:
+        """Return the phases of a sensor's images."""
+        cell = coarsest_cell_of(sensor, self.coarsest_cell) if self.any_sensor else self.coarsest_cell
+        return phases_of(cell, self.column_halvings, self.row_halvings)
+
+    def learned_phases(self) -> list[Phase]:
+        """Return the phases of all images that the networks know: any lattice may be the first one of some sensor."""
+        phases = phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
+        lattices = dict.fromkeys(phase.lattice for phase in phases)
+        return [Phase(each, *at) for each in lattices for at in each.order] if self.any_sensor else phases
 
 
 class Guide(NamedTuple):
@@ -168,7 +159,13 @@ class Guide(NamedTuple):
 
 
 class PhaseNetwork(nn.Module):
-    """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase."""
+    """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase.
+
+    Args:
+        kept: number of channels of the tokenizer's features that it sees.
+        sensor: sensor of the images, with absent rows if there are any.
+        num_rows: number of the sensor's own rows, if some are absent.
+    """
 
     def __init__(
         self,
@@ -178,16 +175,17 @@ class PhaseNetwork(nn.Module):
         kept: int,
         widths: tuple[int, int],
         outputs: int,
+        num_rows: int | None = None,
     ) -> None:
         super().__init__()
-        self.phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
-        self.sensor = sensor
+        self.phases, self._learned = config.phases(sensor), config.learned_phases()
+        self.sensor, self.num_rows = sensor, sensor.height if num_rows is None else num_rows
         kept = kept if features else 0
         self.features = nn.Conv2d(features, kept, 1) if features else nn.Identity()
-        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
+        self.rows = self._rows(config)
         guide = 4 * (kept + config.row_channels + 2)
         self.networks = nn.ModuleDict()
-        for phases in self.by_lattice():
+        for phases in _by_lattice(self._learned):
             lattice = phases[0].lattice
             width = widths[lattice.area >= _COARSE_AREA]
             network = LatticeNetwork(guide, self.context_channels, width, config.blocks, len(phases), outputs)
@@ -197,19 +195,32 @@ class PhaseNetwork(nn.Module):
     before: Tensor
     context_channels: int
 
+    def _rows(self, config: PixelDecoderConfig) -> nn.Parameter | RowEncoding:
+        if not config.any_sensor:
+            return nn.Parameter(torch.zeros(config.row_channels, self.sensor.height))
+        lattices = list(dict.fromkeys(phase.lattice for phase in self.phases))
+        return RowEncoding(config.row_channels, self.sensor, self.num_rows, lattices)
+
+    def row_values(self, lattice: Lattice) -> Float[Tensor, "C H"]:
+        """Return the values of all rows, learned one by one or told by their angles."""
+        return self.rows(lattice) if isinstance(self.rows, RowEncoding) else self.rows
+
     def guided(self, guide: Guide) -> dict[Lattice, Tensor]:
         """Return the first layer's output for the guide, (B, C, h, w), by lattice, the same for all phases."""
-        rows = self.rows[None, :, :, None].expand(len(guide.v), -1, -1, guide.v.shape[-1])
+        count, columns = len(guide.v), guide.v.shape[-1]
         decoded = torch.stack((guide.v - TYPICAL_LOG_RANGE, guide.return_logits / 4), 1)
-        maps = torch.cat((self.features(guide.features), rows, decoded), 1)
-        return {lattice: network.guide(cells_of(maps, lattice)) for lattice, network in self._networks()}
+        features, first_layers = self.features(guide.features), {}
+        for lattice, network in self._networks():
+            rows = self.row_values(lattice)[None, :, :, None].expand(count, -1, -1, columns)
+            first_layers[lattice] = network.guide(cells_of(torch.cat((features, rows, decoded), 1), lattice))
+        return first_layers
 
     def outputs(
         self, phases: list[Phase], guided: dict[Lattice, Tensor], contexts: Float[Tensor, "P B D h w"]
     ) -> Float[Tensor, "P B O h w"]:
         """Return the network's outputs for consecutive phases of one lattice, from what is known before each."""
         lattice = phases[0].lattice
-        first = [phase for phase in self.phases if phase.lattice == lattice].index(phases[0])
+        first = [phase for phase in self._learned if phase.lattice == lattice].index(phases[0])
         return self.networks[lattice.name](guided[lattice], contexts, first)
 
     def generated_before(self, phases: list[Phase]) -> Float[Tensor, "P 1 4 1 1"]:
@@ -221,21 +232,26 @@ class PhaseNetwork(nn.Module):
         """Return the floating-point operations of all phases of one scan: two for each multiplication and addition."""
         pixels = self.sensor.height * self.sensor.width
         total = 2 * pixels * sum(weight.numel() for weight in self.features.parameters() if weight.ndim == 4)
-        for lattice, network in self._networks():
-            once = network.guide.weight.numel() + sum(layer.get_parameter("weight").numel() for layer in network.out)
+        for (lattice, network), phases in zip(self._networks(), self.by_lattice(), strict=True):
+            outputs = list(network.out)[-len(phases) :]
+            once = network.guide.weight.numel() + sum(layer.get_parameter("weight").numel() for layer in outputs)
             each = sum(weight.numel() for weight in network.blocks.parameters() if weight.ndim == 4)
             each += network.context.weight.numel()
-            total += 2 * (pixels // (4 * lattice.area)) * (once + len(network.out) * each)
+            total += 2 * (pixels // (4 * lattice.area)) * (once + len(outputs) * each)
         return total
 
     def by_lattice(self) -> list[list[Phase]]:
         """Return the phases, those of one lattice together."""
-        lattices = dict.fromkeys(phase.lattice for phase in self.phases)
-        return [[phase for phase in self.phases if phase.lattice == lattice] for lattice in lattices]
+        return _by_lattice(self.phases)
 
     def _networks(self) -> list[tuple[Lattice, LatticeNetwork]]:
         networks = [(phases[0].lattice, self.networks[phases[0].lattice.name]) for phases in self.by_lattice()]
         return [(lattice, network) for lattice, network in networks if isinstance(network, LatticeNetwork)]
+
+
+def _by_lattice(phases: list[Phase]) -> list[list[Phase]]:
+    lattices = dict.fromkeys(phase.lattice for phase in phases)
+    return [[phase for phase in phases if phase.lattice == lattice] for lattice in lattices]
 
 
 class MaskNetwork(PhaseNetwork):
@@ -243,10 +259,19 @@ class MaskNetwork(PhaseNetwork):
 
     context_channels = 4 * 2
 
-    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int) -> None:
-        super().__init__(config, sensor, features, config.mask_features, (config.mask_width, config.mask_width), 1)
-        self.row_bias = nn.Parameter(torch.zeros(sensor.height))
-        self.noise = PhaseNoise(self.phases)
+    def __init__(
+        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, num_rows: int | None = None
+    ) -> None:
+        widths = config.mask_width, config.mask_width
+        super().__init__(config, sensor, features, config.mask_features, widths, 1, num_rows)
+        self.row_bias = (
+            nn.Linear(config.row_channels, 1) if config.any_sensor else nn.Parameter(torch.zeros(sensor.height))
+        )
+        places = None
+        if config.any_sensor:
+            rows = (sensor.elevation_rad.double().mean(1) / -ROW_RAD).tolist()
+            places = rows, 2 * math.pi / sensor.width / COLUMN_RAD
+        self.noise = PhaseNoise(self._learned, places)
 
     @classmethod
     def behind(cls, features: int, width: int, sensor: SensorModel) -> "MaskNetwork":
@@ -297,7 +322,7 @@ class MaskNetwork(PhaseNetwork):
         }  # images of one scan share them
         for at, some in enumerate(every):
             numbers[at] = following(numbers[at], [drawn[seed] for seed in some])
-        return torch.stack(numbers).to(self.row_bias.device)
+        return torch.stack(numbers).to(self.before.device)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.
@@ -320,8 +345,15 @@ class MaskNetwork(PhaseNetwork):
     ) -> Float[Tensor, "P B h w"]:
         """Return the logits of the pixels of phases of one lattice; later pixels of the mask have no influence."""
         output = self.outputs(phases, guided, self.context(phases, guide, return_mask))
-        decoded = guide.return_logits + self.row_bias[:, None]
+        decoded = guide.return_logits + self.row_biases(phases[0].lattice)[:, None]
         return output[:, :, 0] + at_phases(decoded, phases)
+
+    def row_biases(self, lattice: Lattice) -> Float[Tensor, "H"]:
+        """Return what is added to the logits of all rows; absent ones never return."""
+        if not isinstance(self.row_bias, nn.Linear):
+            return self.row_bias
+        own = self.row_bias(self.row_values(lattice).T)[: self.num_rows, 0]
+        return F.pad(own, (0, self.sensor.height - self.num_rows), value=_NEVER)
 
     def phase_nll(
         self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, returned: Bool[Tensor, "B H W"]

@@ -50,6 +50,11 @@ class RangeMixture:
         """Return the distributions of some pixels, one after the other."""
         return RangeMixture(self.logits[pixels], self.centres[pixels], self.log_scales[pixels], self.limits_m)
 
+    def without_last(self) -> "RangeMixture":
+        """Return the distributions of all components but the last."""
+        logits, centres, log_scales = (part[..., :-1] for part in (self.logits, self.centres, self.log_scales))
+        return RangeMixture(logits, centres, log_scales, self.limits_m)
+
     def log_density(self, range_m: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
         """Return the natural logarithm of the probability density per metre."""
         v = range_m.log1p()[..., None]

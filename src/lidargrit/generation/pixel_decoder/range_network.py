@@ -13,7 +13,6 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     Phase,
     at_phases,
     cells_of,
-    phases_of,
     pixels_around,
 )
 from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
@@ -23,6 +22,8 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE
 
 _FREE_COMPONENTS = 4  # of a range's distribution, begin at the decoded range; others begin at neighbours
 _DECODED_HEAD_START = 4.0  # of the logits of decoded components: before training they are nearly all there is
+_UNEXPECTED = 1e-4  # probability of any range at all, by a network for any sensor: its bits have a bound
+_UNIFORM_LOG_SCALE = 1.0  # of such a range, in v: nearly flat between the limits
 _NEAR_V = 0.01  # a difference in v that is half of a large one: a hundredth of the range
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
@@ -38,17 +39,23 @@ class RangeNetwork(PhaseNetwork):
     """
 
     def __init__(
-        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, decoded: int = 0, gaps: bool = False
+        self,
+        config: PixelDecoderConfig,
+        sensor: SensorModel,
+        features: int,
+        decoded: int = 0,
+        gaps: bool = False,
+        num_rows: int | None = None,
     ) -> None:
-        phases = phases_of(config.coarsest_cell, config.column_halvings, config.row_halvings)
+        phases = config.phases(sensor)
         suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
         self.has_gaps, self.is_told = gaps or not features, gaps
         added = self.has_gaps + (4 + decoded) * self.is_told
         self.context_channels = 4 * 3 + suggest.count + suggest.distances + added
         components = _FREE_COMPONENTS + suggest.count + decoded
         widths = (config.range_width, config.coarse_range_width or config.range_width)
-        super().__init__(config, sensor, features, config.range_features, widths, 3 * components)
-        self.suggest, self.decoded = suggest, decoded
+        super().__init__(config, sensor, features, config.range_features, widths, 3 * components, num_rows)
+        self.suggest, self.decoded, self.any_sensor = suggest, decoded, config.any_sensor
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
         spread = torch.linspace(-0.2, 0.2, _FREE_COMPONENTS)
         scale = torch.cat((torch.zeros(_FREE_COMPONENTS), torch.full((suggest.count,), -2.0), torch.zeros(decoded)))
@@ -149,6 +156,11 @@ class RangeNetwork(PhaseNetwork):
         centres = torch.cat((free, anchored), 2).clamp(low, high)
         log_scales_m = scales.clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
         log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
+        if self.any_sensor:
+            any_range = logits.logsumexp(2, keepdim=True) + math.log(_UNEXPECTED)
+            logits = torch.cat((logits, any_range), 2)
+            centres = torch.cat((centres, torch.full_like(any_range, (low + high) / 2)), 2)
+            log_scales = torch.cat((log_scales, torch.full_like(any_range, _UNIFORM_LOG_SCALE)), 2)
         logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
         return RangeMixture(logits, centres, log_scales, self.limits_m)
 

@@ -9,7 +9,7 @@ from lidargrit.core import configuration
 from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, nearest_names
 from lidargrit.data.images import Provenance
-from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant, trained_on
+from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant, takes_any_sensor, trained_on
 from lidargrit.data.sources.scan_sensor import other_sensor
 from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.generator import Generator, load, load_class
@@ -82,7 +82,7 @@ def open_model(
     Args:
         word: folder of a run or of a bundle, ``pretrained``, or a classical method: nearest, linear or triangulation.
         kind: kind of the conditions that it will be given.
-        sensor: sensor of the scans, which a classical method needs; a run has its own.
+        sensor: sensor of the scans, which a classical method needs; a run has its own, unless it takes any.
         settings: settings of the run's sampling, as NAME=VALUE.
 
     Raises:
@@ -106,6 +106,8 @@ def open_model(
             wanted = f"a run's folder, or {nearest_names(word, known)}"
             raise ConfigError(f"--model {word}, which does not exist", wanted, "check the name")
         generator = load(folder)
+        if sensor is not None and takes_any_sensor(folder):
+            generator = generator.for_sensor(sensor)
     generator = generator.to(usable_device(device))
     if kind not in generator.conditions:
         takes = " or ".join(KINDS[one] for one in sorted(generator.conditions)) or "no condition at all"

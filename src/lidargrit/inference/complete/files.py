@@ -1,8 +1,9 @@
 """Scans of a user → their completions in files, which have the names of the scans."""
 
+import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import accumulate, chain, groupby, islice
 from pathlib import Path
 from typing import Any
@@ -14,15 +15,17 @@ from torch import Tensor
 
 from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.core.shares import each_done
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.scan_folder import IMAGE, TREE, KittiTree, ScanFolder, check_names, write_array
 from lidargrit.data.sources.image_files import PROBABILITY
-from lidargrit.inference.complete import Model
+from lidargrit.inference.complete import Model, open_model
 from lidargrit.inference.complete.clouds_to_files import suffix_of, write_cloud
 from lidargrit.inference.complete.inputs import Inputs, InputScan, open_inputs
 from lidargrit.inference.complete.tasks import Task, complete_images
 from lidargrit.scans.condition import Observed
+from lidargrit.scans.sensors import ProjectionOption, SensorModel
 from lidargrit.scans.types import RangeImage
 
 _FILES_AT_MOST = 400_000  # as many as the largest data set has scans; the manifest names each
@@ -59,7 +62,7 @@ class Written:
     """What a verb wrote.
 
     Args:
-        scans: number of completed scans that are there now.
+        scans: number of completed scans that are there now, or were written with a batch.
         points_in: number of points of the scans that were read now; 0 for range images.
         points_out: number of points of the files that were written now.
         points_filled: number of these that a model added.
@@ -81,52 +84,166 @@ class _Job:
     form: type[ScanFormat] | None
 
 
-def write_completions(
-    inputs: Inputs,
+@dataclass(frozen=True)
+class _Work:
+    """What is completed and how: all that a machine of a cluster needs to complete some of it."""
+
+    source: str
+    out: Path
+    model: str
+    sensor: str  # of a classical method, as JSON
+    sampling: object
+    projection: ProjectionOption
+    device: str
+    task: Task
+    output: OutputConfig
+    config: DataConfig
+
+
+@dataclass(frozen=True, eq=False)
+class _Completion:
+    """The scans of a user, and the folder and the model that they are completed in and by."""
+
+    inputs: Inputs
+    folder: ScanFolder
+    model: Model
+    task: Task
+    output: OutputConfig
+
+    @classmethod
+    def of(
+        cls,
+        source: str,
+        out: Path,
+        model: Model,
+        task: Task,
+        output: OutputConfig,
+        config: DataConfig,
+    ) -> "_Completion":
+        """Open scans and folder; ``completed.json`` says how the files were made, and of which scans."""
+        reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)
+        inputs = open_inputs(source, reader, config)
+        inputs.check_output(out)
+        files = _files(inputs, source, output)
+        facts = {"verb": task.verb, "source": source, **task.identity(), **_facts(model, output)}
+        identities = [inputs.identity(number // output.count) for number in range(len(files))]
+        folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans)
+        return cls(inputs, folder, model, task, output)
+
+    def write(self, jobs: Iterable[_Job]) -> "Iterator[Written]":
+        """Complete scans and write them; yield what was written with each batch."""
+        for batch in _batches(jobs, self.model.batch_size):
+            counts = np.zeros(3, dtype=np.int64)
+            for job, images in zip(batch, _completed(self.model, batch, self.output.seed), strict=True):
+                counts += self._write_one(job, images)
+            points_in, points_out, points_filled = counts.tolist()
+            yield Written(len(batch), points_in, points_out, points_filled)
+
+    def _write_one(self, job: _Job, images: RangeImage) -> Int64[np.ndarray, "3"]:
+        folder, output = self.folder, self.output
+        file = folder.files[job.index * output.count + job.turn]
+        if output.probability and job.turn == 0:
+            write_array(folder.out / _probability_file(file), _return_share(self.model, job, output))
+        folder.tell_sensor(self.sensor_of(job))
+        kept_labels, points = images.label is None, np.zeros(3, dtype=np.int64)
+        if output.format == IMAGE:
+            write_array(folder.out / file, images.range_m[0])
+        else:
+            kept_labels, points = _write_cloud(folder.out / file, output.format, self.task, job, images)
+        if not kept_labels:
+            folder.tell_labels_lost(file)
+        return points
+
+    def sensor_of(self, job: _Job) -> SensorModel:
+        """Return the rays on which the pixels or points of a file lie."""
+        return self.model.sensor if self.output.format == IMAGE else self.task.sensor_of_points(job.scan)
+
+    def jobs(self, files: Sequence[int]) -> Iterator[_Job]:
+        """Read each scan of some of the files once."""
+        count = self.output.count
+        for index, of_scan in groupby(files, lambda file: file // count):
+            job = None
+            with self.folder.leaving_out(*range(index * count, (index + 1) * count)):
+                seen = None if self.output.format == IMAGE else partial(self.task.see, model=self.model)
+                scan, number = self.inputs.read(index, seen), self.inputs.number(index)
+                condition = self.task.condition(scan, derive_seed(self.output.seed, number))
+                job = _Job(index, number, 0, scan, condition, self.inputs.form(index))
+            if job is not None:
+                for file in of_scan:
+                    yield replace(job, turn=file % count)
+
+
+@lru_cache(maxsize=1)  # for all shares of a worker
+def _completion_of(work: _Work) -> _Completion:
+    sensor = SensorModel.from_json(json.loads(work.sensor)) if work.sensor else None
+    model = open_model(work.model, work.task.kind, sensor, device=work.device)
+    model = replace(model, sampling=work.sampling, projection=work.projection)
+    return _Completion.of(work.source, work.out, model, work.task, work.output, work.config)
+
+
+def _write_some(work: _Work, files: Sequence[int]) -> tuple[int, list[Written], list[int]]:
+    """Write some of the files, and return how many these are, what was written, and which of them were left out."""
+    completion = _completion_of(work)
+    missing = [file for file in files if not (work.out / completion.folder.files[file]).exists()]
+    written = [*completion.write(completion.jobs(missing))]
+    return len(files), written, [file for file in files if completion.folder.is_left_out(file)]
+
+
+def complete_scans(
+    source: str,
     out: Path,
     model: Model,
     task: Task,
     output: OutputConfig,
-    facts: dict[str, Any],
-    config: DataConfig,
+    config: DataConfig | None = None,
+    *,
+    ray: str = "",
+    device: str = "",
 ) -> Written:
-    """Complete every scan and write it; files that are there already are not written again.
+    """Complete every scan of a source and write it; files that are there already are not written again.
 
     With several completions of each scan the files lie in ``out/completion_0`` and so on, each a whole set of scans.
     ``completed.json`` says how they were made, and ``sensor.json`` on which rays points lie.
 
     Args:
-        inputs: scans of the user.
+        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: an empty folder, or one that the same command began.
-        task, output: work on each scan; number and kind of files.
-        facts: further entries of ``completed.json``, among them the ``source``; a folder with other entries is refused.
-        config: treatment of scans that cannot be used; nothing else of it is used.
+        model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
+        task: the work on each scan.
+        output: number and kind of files.
+        config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
+        ray: address of a Ray cluster that completes; see :func:`each_done`.
+        device: device of each task there, as in :func:`lidargrit.inference.complete.open_model`.
+
+    Returns:
+        what was written, and how many points came in and went out.
     """
-    inputs.check_output(out)
-    files, facts = _files(inputs, str(facts["source"]), output), facts | _facts(model, output)
-    identities = [inputs.identity(number // output.count) for number in range(len(files))]
-    folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans)
-    jobs = _jobs(inputs, folder, model, task, output)
+    config = config or DataConfig()
+    completion = _Completion.of(source, out, model, task, output, config)
+    folder = completion.folder
+    jobs = completion.jobs(folder.missing)
     first = list(islice(jobs, 1))  # a mistake in it is told before anything is written
-    counts = np.zeros(3, dtype=np.int64)
+    written: list[Written] = []
     with folder.writing(task.progress) as progress:
-        for batch in _batches(chain(first, jobs), model.batch_size):
-            for job, images in zip(batch, _completed(model, batch, output.seed), strict=True):
-                file = files[job.index * output.count + job.turn]
-                if output.probability and job.turn == 0:
-                    write_array(out / _probability_file(file), _return_share(model, job, output))
-                folder.tell_sensor(images.sensor if output.format == IMAGE else task.sensor_of_points(job.scan))
-                if output.format == IMAGE:
-                    write_array(out / file, images.range_m[0])
-                    kept_labels = images.label is None
-                else:
-                    kept_labels, points = _write_cloud(out / file, output.format, task, job, images)
-                    counts += points
-                if not kept_labels:
-                    folder.tell_labels_lost(file)
-                progress.advance(1)
-    points_in, points_out, points_filled = counts.tolist()
-    return Written(folder.num_written, points_in, points_out, points_filled)
+        if ray and first:
+            folder.tell_sensor(completion.sensor_of(first[0]))  # whichever file is written first
+            named = json.dumps(model.sensor.to_json()) if model.folder is None else ""
+            settings = model.sampling, model.projection, device
+            work = _Work(source, out, model.name, named, *settings, task, output, config)
+            size = model.batch_size
+            shares = [folder.missing[first : first + size] for first in range(0, len(folder.missing), size)]
+            for count, some, left_out in each_done(
+                partial(_write_some, work), shares, ray=ray, on_gpus=device != "cpu"
+            ):
+                folder.leave_out(left_out)
+                written += some
+                progress.advance(count)
+        else:
+            for some in completion.write(chain(first, jobs)):
+                written.append(some)
+                progress.advance(some.scans)
+    points = (sum(getattr(each, name) for each in written) for name in ("points_in", "points_out", "points_filled"))
+    return Written(folder.num_written, *points)
 
 
 def _write_cloud(
@@ -172,20 +289,6 @@ def _files(inputs: Inputs, source: str, output: OutputConfig) -> list[str]:
     return [_folder(turn, output.count) + name for name in names for turn in range(output.count)]
 
 
-def _jobs(inputs: Inputs, folder: ScanFolder, model: Model, task: Task, output: OutputConfig) -> Iterator[_Job]:
-    """Read each scan of missing files once."""
-    for index, files in groupby(folder.missing, lambda file: file // output.count):
-        job = None
-        with folder.leaving_out(*range(index * output.count, (index + 1) * output.count)):
-            scan = inputs.read(index, None if output.format == IMAGE else partial(task.see, model=model))
-            number = inputs.number(index)
-            condition = task.condition(scan, derive_seed(output.seed, number))
-            job = _Job(index, number, 0, scan, condition, inputs.form(index))
-        if job is not None:
-            for file in files:
-                yield replace(job, turn=file % output.count)
-
-
 def _batches(jobs: Iterable[_Job], at_most: int) -> Iterator[list[_Job]]:
     """Group jobs that follow one another; scans of a batch have the same planes."""
     for _, alike in groupby(jobs, lambda job: job.condition.planes.keys()):
@@ -219,31 +322,3 @@ def _probability_file(file: str) -> str:
 
 def _folder(turn: int, count: int) -> str:
     return f"completion_{turn}/" if count > 1 else ""
-
-
-def complete_scans(
-    source: str,
-    out: Path,
-    model: Model,
-    task: Task,
-    output: OutputConfig,
-    config: DataConfig | None = None,
-) -> Written:
-    """Write the scans of a source as a task changes them: whole clouds, or the images of the model.
-
-    Args:
-        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
-        out: an empty folder, or one that the same command began.
-        model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
-        task: the work on each scan.
-        output: number and kind of files.
-        config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
-
-    Returns:
-        what was written, and how many points came in and went out.
-    """
-    config = config or DataConfig()
-    reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)
-    inputs = open_inputs(source, reader, config)
-    facts = {"verb": task.verb, "source": source, **task.identity()}
-    return write_completions(inputs, out, model, task, output, facts, config)

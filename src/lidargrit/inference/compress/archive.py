@@ -9,7 +9,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -45,14 +45,14 @@ def writing(path: Path, header: dict[str, Any], chosen: dict[str, Any] | None = 
             writer.write(path)
             writer.remove()
         finally:
-            if not writer.num_scans:  # nothing to go on with
+            if not writer.sizes():  # nothing to go on with
                 writer.remove()
     with suppress(OSError):
         folder.rmdir()
 
 
 class ArchiveWriter:
-    """Writes a file of compressed scans, one by one, and keeps nothing of them in memory.
+    """Writes a file of compressed scans, of which several processes may compress some, and keeps none in memory.
 
     Args:
         folder: folder in which they lie until all are there.
@@ -61,13 +61,8 @@ class ArchiveWriter:
     """
 
     def __init__(self, folder: Path, header: dict[str, Any], chosen: dict[str, Any]) -> None:
-        self._folder, self._header, options = folder, header, folder / _OPTIONS
-        self.num_scans = self.num_returns = self.num_names = 0
-        self._identities: list[str] = []
-        for _, identity, num_returns, compressed in self._written():
-            self._identities.append(identity)
-            self._count(compressed, num_returns)
-        if self._identities:
+        self.folder, self._header, options = folder, header, folder / _OPTIONS
+        if self._numbers():
             self._claim(read_json(options), chosen)
         write_json(options, {"header": header, "chosen": chosen})
 
@@ -83,29 +78,30 @@ class ArchiveWriter:
         if changed:
             raise self._of_others(f"scans of other options ({', '.join(changed)})")
 
-    def go_on(self, identities: Iterator[str]) -> int:
-        """Return the number of scans of an unfinished file, which are the first of those that are to be written.
+    def missing(self, identities: Sequence[str]) -> list[int]:
+        """Return the numbers of the scans that are still to be written.
 
         Args:
-            identities: identity of each of the scans that are to be written.
+            identities: identity of each of the scans that the file will hold.
         """
-        for number, identity in enumerate(self._identities):
-            if identity != next(identities, None):
-                raise self._of_others(f"the scan {number}, {identity}, which is not the next of these")
-        return self.num_names
+        there = self._numbers()
+        for number in there:
+            _, identity, _ = _facts(self.folder / str(number))
+            if identity not in identities[number : number + 1]:
+                raise self._of_others(f"the scan {number}, {identity}, which is none of these")
+        return sorted({*range(len(identities))} - {*there})
 
-    def add(self, name: str, identity: str, compressed: bytes, num_returns: int) -> None:
-        """Write one scan; without bytes, that it was left out."""
-        with atomic_path(self._folder / str(self.num_names)) as unfinished:
-            unfinished.write_bytes(json.dumps([name, identity, num_returns]).encode() + b"\n" + compressed)
-        self._count(compressed, num_returns)
+    def sizes(self) -> list[int]:
+        """Return the number of returns of each scan that is there and was not left out."""
+        return [returns for _, returns, compressed in self._written() if compressed]
 
     def write(self, path: Path) -> None:
         """Write the file."""
         names = []
         with atomic_path(path) as unfinished, zipfile.ZipFile(unfinished, "w") as archive:
-            _add(archive, _HEADER, json.dumps(self._header, sort_keys=True).encode())
-            for name, _, _, compressed in self._written():
+            packed = zipfile.ZIP_DEFLATED if "rays" in self._header else zipfile.ZIP_STORED  # a long list of angles
+            _add(archive, _HEADER, json.dumps(self._header, sort_keys=True).encode(), packed)
+            for name, _, compressed in self._written():
                 if compressed:
                     _add(archive, str(len(names)), compressed)
                     names.append(name)
@@ -113,24 +109,37 @@ class ArchiveWriter:
 
     def remove(self) -> None:
         """Remove the scans from the folder."""
-        for name in [*map(str, range(self.num_names)), _OPTIONS]:
-            (self._folder / name).unlink(missing_ok=True)
+        for name in [*map(str, self._numbers()), _OPTIONS]:
+            (self.folder / name).unlink(missing_ok=True)
 
-    def _written(self) -> Iterator[tuple[str, str, int, bytes]]:
-        number = 0
-        while (path := self._folder / str(number)).exists():
-            facts, _, compressed = path.read_bytes().partition(b"\n")
-            yield *json.loads(facts), compressed
-            number += 1
+    def _numbers(self) -> list[int]:
+        return sorted(int(entry.name) for entry in os.scandir(self.folder) if entry.name.isdecimal())
 
-    def _count(self, compressed: bytes, num_returns: int) -> None:
-        self.num_names += 1
-        self.num_scans += bool(compressed)
-        self.num_returns += num_returns
+    def _written(self) -> Iterator[tuple[str, int, bytes]]:
+        for number in self._numbers():
+            facts, _, compressed = (self.folder / str(number)).read_bytes().partition(b"\n")
+            name, _, returns = json.loads(facts)
+            yield name, returns, compressed
 
     def _of_others(self, held: str) -> OutputError:
-        got = f"{self._folder}, an unfinished file with {held}"
+        got = f"{self.folder}, an unfinished file with {held}"
         return OutputError(got, "the command that began it", "give that command again, or remove the folder")
+
+
+def add_scan(folder: Path, number: int, facts: tuple[str, str, int], compressed: bytes) -> None:
+    """Write one scan beside an unfinished file; without bytes, that it was left out.
+
+    Args:
+        facts: name, identity, and number of returns.
+    """
+    with atomic_path(folder / str(number)) as unfinished:
+        unfinished.write_bytes(json.dumps(facts).encode() + b"\n" + compressed)
+
+
+def _facts(path: Path) -> tuple[str, str, int]:
+    with path.open("rb") as file:
+        name, identity, returns = json.loads(file.readline())
+    return name, identity, returns
 
 
 def _add(archive: zipfile.ZipFile, name: str, data: bytes, method: int = zipfile.ZIP_STORED) -> None:

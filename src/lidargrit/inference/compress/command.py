@@ -1,7 +1,9 @@
 """A source of scans → one file of compressed range images, and back into a file for each scan."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -9,17 +11,21 @@ import torch
 
 from lidargrit.core import reporting
 from lidargrit.core.errors import CheckpointError, ScanError, UsageError, no_usable_scan
+from lidargrit.core.shares import each_done
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, projection_variant
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format, write_array
 from lidargrit.generation.generator import load
-from lidargrit.inference.complete.inputs import ScanReader, open_inputs
-from lidargrit.inference.compress.archive import Archive, writing
+from lidargrit.inference.complete.inputs import Inputs, ScanReader, open_inputs
+from lidargrit.inference.compress.archive import Archive, add_scan, writing
 from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.projection import unproject
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
+
+_SHARE_ON_RAY = 4  # scans: seconds of work, for a task takes a cluster 30 ms
 
 
 @dataclass(frozen=True)
@@ -41,7 +47,15 @@ class Compressed:
         return 8 * self.num_bytes / max(self.num_returns, 1)
 
 
-def compress_scans(source: str, out: Path, model: str, step_mm: int, config: DataConfig) -> Compressed:
+def compress_scans(
+    source: str,
+    out: Path,
+    model: str,
+    step_mm: int,
+    config: DataConfig,
+    ray: str = "",
+    sensor: SensorModel | None = None,
+) -> Compressed:
     """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
 
     Args:
@@ -49,36 +63,85 @@ def compress_scans(source: str, out: Path, model: str, step_mm: int, config: Dat
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         config: number of scans, and what to do with unusable points and scans.
+        ray: address of a Ray cluster that compresses; see :func:`each_done`.
+        sensor: sensor of the scans, for a run that takes any, which the file then names; the run's own if not given.
     """
-    codec = ScanCodec(load(model), step_mm)
-    reader = ScanReader(codec.sensor, projection_variant(locate(model)), projection=config.projection)
-    inputs = open_inputs(source, reader, config)
-    check_names(source, [inputs.name(index) for index in range(len(inputs))])  # of which a file has each once
-    chosen = {"source": source, "max_scans": config.max_scans}
+    work = _Work(source, model, step_mm, config, "" if sensor is None else json.dumps(sensor.to_json()))
+    compressor = _Compressor.of(work)
+    inputs, chosen = compressor.inputs, {"source": source, "max_scans": config.max_scans}
+    names = [inputs.name(index) for index in range(len(inputs))]
+    check_names(source, names)  # of which a file has each once
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
-    told = False
-    with writing(out, _header(codec, model), chosen) as writer:
-        done = writer.go_on(inputs.identity(index) for index in range(len(inputs)))
-        with reporting.progress("compressing", len(inputs), done) as progress:
-            for index in range(done, len(inputs)):
-                scan = inputs.name(index), inputs.identity(index)
-                try:
-                    image = inputs.read(index).image
-                    data, returns = codec.compress(image), int(image.return_mask.sum())
-                except ScanError as error:
-                    if config.bad_scans == "refuse":
-                        raise
-                    reporting.message(f"left out: {error}")
-                    writer.add(*scan, b"", 0)
-                else:
-                    writer.add(*scan, data, returns)
-                    if not told and (lost := _not_kept(image)):
-                        told = True
-                        reporting.message(f"{out.suffix} keeps no {lost}")
-                progress.advance(1)
-        if not writer.num_scans:
+    with writing(out, _header(compressor.codec, model, sensor), chosen) as writer:
+        missing = writer.missing([inputs.identity(index) for index in range(len(inputs))])
+        do = partial(_write_some, work, writer.folder) if ray else partial(compressor.write, writer.folder)
+        size = _SHARE_ON_RAY if ray else 1
+        shares = [missing[first : first + size] for first in range(0, len(missing), size)]
+        with reporting.progress("compressing", len(inputs), len(inputs) - len(missing)) as progress:
+            for count in each_done(do, shares, ray=ray):
+                progress.advance(count)
+        returns = writer.sizes()
+        if not returns:
             raise no_usable_scan(source)
-    return Compressed(writer.num_scans, writer.num_returns, out.stat().st_size)
+    return Compressed(len(returns), sum(returns), out.stat().st_size)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What is compressed and how: all that a machine of a cluster needs to do some of it.
+
+    Args:
+        rays: sensor of the scans as JSON; "" for the model's own.
+    """
+
+    source: str
+    model: str
+    step_mm: int
+    config: DataConfig
+    rays: str = ""
+
+
+@dataclass(eq=False)
+class _Compressor:
+    """A model and the scans that it compresses."""
+
+    codec: ScanCodec
+    inputs: Inputs
+    skips: bool
+    told: bool = False
+
+    @classmethod
+    def of(cls, work: _Work) -> "_Compressor":
+        """Open the model and the scans."""
+        sensor = SensorModel.from_json(json.loads(work.rays)) if work.rays else None
+        codec, config = _codec(work.model, work.step_mm, sensor), work.config
+        reader = ScanReader(codec.sensor, projection_variant(locate(work.model)), projection=config.projection)
+        return cls(codec, open_inputs(work.source, reader, config), config.bad_scans == "skip")
+
+    def write(self, folder: Path, indices: Sequence[int]) -> int:
+        """Compress some scans into a folder, and return their number."""
+        for index in indices:
+            data, returns = b"", 0
+            try:
+                image = self.inputs.read(index).image
+                data, returns = self.codec.compress(image), int(image.return_mask.sum())
+            except ScanError as error:
+                if not self.skips:
+                    raise
+                reporting.message(f"left out: {error}")
+            else:
+                if not self.told and (lost := _not_kept(image)):
+                    self.told = True
+                    reporting.message(f".lgz keeps no {lost}")
+            add_scan(folder, index, (self.inputs.name(index), self.inputs.identity(index), returns), data)
+        return len(indices)
+
+
+_compressor_of = lru_cache(maxsize=1)(_Compressor.of)  # for all shares of a worker
+
+
+def _write_some(work: _Work, folder: Path, indices: Sequence[int]) -> int:
+    return _compressor_of(work).write(folder, indices)
 
 
 def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int]) -> int:
@@ -123,9 +186,16 @@ def _not_kept(image: RangeImage) -> str:
     return " and no ".join(name for name, pixels in held if pixels is not None)
 
 
-def _header(codec: ScanCodec, model: str) -> dict[str, Any]:
+def _codec(model: str, step_mm: int, sensor: SensorModel | None) -> ScanCodec:
+    generator = load(model)
+    return ScanCodec(generator if sensor is None else generator.for_sensor(sensor), step_mm)
+
+
+def _header(codec: ScanCodec, model: str, given: SensorModel | None) -> dict[str, Any]:
     sensor = codec.sensor
+    rays = {} if given is None else {"rays": given.to_json()}
     return {
+        **rays,
         "model": Path(model).name,
         "model_sha256": codec.digest(),
         "step_mm": codec.steps.step_mm,
@@ -140,7 +210,8 @@ def _codec_of(archive: Archive, model: str) -> ScanCodec:
     step_mm, digest = archive.header.get("step_mm"), archive.header.get("model_sha256")
     if not (isinstance(step_mm, int) and isinstance(digest, str)):
         raise not_reproduced()
-    codec = ScanCodec(load(model), step_mm)
+    rays = archive.header.get("rays")
+    codec = _codec(model, step_mm, None if rays is None else SensorModel.from_json(rays))
     if codec.digest() != digest:
         archive_of = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
         cure = f"name that run with --model: {model} has the hash {codec.digest()[:12]}"

@@ -91,6 +91,7 @@ class ScanCodec:
             device = next(self._encoder.parameters()).device
             tokens = self._encoder.encode(rounded.to(device)).tokens.flatten().cpu().numpy()
         pixels = self.steps.indices(rounded.range_m[0]).where(rounded.return_mask[0], 0).numpy()
+        pixels = np.pad(pixels, ((0, self._pixels.grid.height - len(pixels)), (0, 0)))  # in absent rows nothing returns
         coder = Encoder()
         self._code(coder, Known(tokens, pixels))
         compressed = _hash(pixels) + coder.words()
@@ -105,7 +106,7 @@ class ScanCodec:
         pixels = self._code(Decoder(compressed[_HASH_BYTES:]), None)
         if _hash(pixels) != compressed[:_HASH_BYTES]:
             raise not_reproduced()
-        found = torch.from_numpy(pixels)
+        found = torch.from_numpy(pixels)[: self.sensor.height]
         return RangeImage.masked(self.steps.range_m(found), found > 0, self.sensor)
 
     def _code(self, coder: Coder, known: Known | None) -> Pixels:

@@ -11,7 +11,7 @@ from torch import Tensor
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json
-from lidargrit.core.untrusted import user_path
+from lidargrit.core.untrusted import seed_number, user_path
 from lidargrit.scans.sensors._checks import (
     FINE_COLUMNS_AT_MOST,
     check_projection,
@@ -24,6 +24,7 @@ from lidargrit.scans.sensors._checks import continuous_azimuths_rad as continuou
 from lidargrit.scans.sensors._checks import mean_azimuths_rad as mean_azimuths_rad
 from lidargrit.scans.sensors._setup import SensorSetup as SensorSetup
 
+_DRAWN = "drawn_"
 _REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
 
 ProjectionName = Literal["spherical", "unfolding"]
@@ -180,12 +181,17 @@ def _setup_of(data: Any) -> SensorSetup:
 
 
 def load_sensor(name: str) -> SensorModel:
-    """Return a sensor by its name ("hdl64e_kitti_360", ...) or from a ``.json`` file.
+    """Return a sensor by its name ("hdl64e_kitti_360", ...), from a ``.json`` file, or the drawn one of a seed
+    ("drawn_7").
 
     Raises:
         UnknownNameError: no sensor of that name; names its nearest neighbours.
         ConfigError: the file cannot be read, or does not hold a sensor.
     """
+    if name.startswith(_DRAWN) and name.removeprefix(_DRAWN).isdecimal():
+        from lidargrit.scans.drawn_sensors import drawn_sensor  # noqa: PLC0415  which shifts sensors that are loaded here
+
+        return drawn_sensor(seed_number(name.removeprefix(_DRAWN)))
     if not name.lower().endswith(".json"):
         return discovery.load_instance("sensors", name, SensorModel)
     wanted, cure = "the JSON of a sensor", "write one with: lidargrit fit-sensor, or SensorModel.to_json"

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
-from lidargrit.generation.presets import MORE_STREETS, PIXEL_DECODER, PIXELS, WIDE_STREETS, preset
+from lidargrit.generation.presets import ANY_SENSOR, MORE_STREETS, PIXEL_DECODER, PIXELS, WIDE_STREETS, preset
 from lidargrit.systems.multiscale.system import MultiscaleConfig
 
 PRESETS = {
@@ -12,6 +12,12 @@ PRESETS = {
         "a pixel decoder without tokens, small: 64x256, for one CPU core and half an hour",
         MORE_STREETS,
         MultiscaleConfig(PIXEL_DECODER),
+        pixels=replace(PIXELS, scans=16_000, average_over_scans=700),
+    ),
+    "multiscale_any": preset(
+        "a pixel decoder without tokens for any spinning sensor: for one CPU core and an hour",
+        ANY_SENSOR,
+        MultiscaleConfig(replace(PIXEL_DECODER, row_channels=4, any_sensor=True)),
         pixels=replace(PIXELS, scans=16_000, average_over_scans=700),
     ),
     # The last phases halve the distance between columns alone.

@@ -1,0 +1,105 @@
+"""What data sets share that a library of their makers reads: a folder of drives → scans of the first LiDAR of each."""
+
+from abc import abstractmethod
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar, Protocol, runtime_checkable
+
+from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.data.datasets import Motion
+from lidargrit.data.datasets.shared.files import FileDataset, hashed_name
+from lidargrit.data.formats import BadPoints
+from lidargrit.scans.types import Scan
+
+
+@runtime_checkable
+class Drive(Protocol):
+    """One LiDAR of a drive that a library has opened."""
+
+    def __len__(self) -> int:
+        """Return the number of its scans."""
+        ...
+
+    def scan(self, index: int, bad_points: BadPoints) -> Scan:
+        """Read one scan."""
+        ...
+
+    def motion(self, index: int) -> Motion:
+        """Return when and where a scan was made."""
+        ...
+
+
+class LibraryDataset(FileDataset):
+    """Drives that a library reads, which this program does not install by itself."""
+
+    format = ""
+    examples = ()
+    library: ClassVar[str]
+    """Name of the library in the package index."""
+
+    @classmethod
+    @abstractmethod
+    def open_drive(cls, path: Path) -> Drive:
+        """Open the drive of a file."""
+
+    @classmethod
+    def _opened(cls, path: Path) -> Drive:
+        try:
+            return _opened_once(cls, path, path.stat().st_mtime_ns)
+        except ImportError:
+            cure = f"pip install 'lidargrit[{cls.public_name()}]', in an environment of its own"
+            raise DataError(f"{path}, which takes {cls.library} to read", "it installed", cure) from None
+        except DataError:
+            raise
+        except Exception as error:  # libraries meet damaged files with whatever they stumble over
+            raise cls._unusable(path, error) from None
+
+    @classmethod
+    def _unusable(cls, path: Path, error: Exception) -> DataError:
+        what = " ".join(str(error).split())[:200] or type(error).__name__
+        cure = "copy it anew, or leave it out"
+        return DataError(f"{path}, which {cls.library} cannot read ({what})", cls.tree, cure)
+
+    @classmethod
+    def scans_in(cls, path: Path, topic: str = "") -> int:
+        """Count the scans of a drive's first LiDAR."""
+        return len(cls._opened(path))
+
+    def scan(self, index: int) -> Scan:
+        """Read one scan."""
+        path, number = self._scans[index]
+        drive = self._opened(path)
+        try:
+            return drive.scan(number, self.bad_points)
+        except ScanError:
+            raise
+        except Exception as error:
+            unusable = self._unusable(path, error)
+            raise ScanError(f"scan {number} of {unusable.got}", unusable.wanted, unusable.cure) from None
+
+    def motion(self, index: int) -> Motion:
+        """Return time and pose of a scan, as its drive tells."""
+        path, number = self._scans[index]
+        return self._opened(path).motion(number)
+
+    def companions(self, index: int) -> tuple[Path, ...]:
+        """Return nothing: the library finds what lies beside a file."""
+        return ()
+
+    def recording_of(self, path: Path) -> str:
+        """Name a recording by its file."""
+        return hashed_name(path.resolve())
+
+    @classmethod
+    def _pattern_in(cls, root: Path) -> str | None:
+        return next((pattern for pattern in cls.patterns if any(root.glob(pattern))), None)
+
+    @classmethod
+    def write_example(cls, root: Path, num_scans: int) -> None:
+        """Refuse: the library reads here, and writes nothing."""
+        raise OutputError(f"an example of {cls.title}", "a layout that can be written", "take another")
+
+
+@lru_cache(maxsize=2)  # scans are read drive by drive
+def _opened_once(cls: type[LibraryDataset], path: Path, changed_ns: int) -> Drive:
+    return cls.open_drive(path)
