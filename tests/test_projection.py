@@ -177,7 +177,7 @@ def test_images_that_contradict_themselves_are_refused():
 @pytest.mark.parametrize("use", [project, index_map, inspect])
 def test_a_word_that_names_no_projection_is_refused(use):
     scan, sensor = scan_at([[10.0, 0, 0], [0, 10.0, 0]]), load_sensor("vlp16")
-    with pytest.raises(ConfigError, match="got variant='exat'; wanted exact or reference; correct it"):
+    with pytest.raises(ConfigError, match="got variant='exat'; wanted exact, reference or clamped; correct it"):
         use(scan, sensor, variant="exat")
     with pytest.raises(ConfigError, match="got method='sphericl'; wanted spherical or unfolding; correct it"):
         use(scan, sensor, "sphericl")

@@ -19,7 +19,7 @@ ON_KITTI = {  # preset → its data set
     name: source.partition(":")[0]
     for name in discovery.names("presets")
     for source in load_preset(name).data.train
-    if source.partition(":")[0] in TREES
+    if source.partition(":")[0] in TREES and source.split(":")[1].startswith("data/")  # others are simulated drives
 }
 
 

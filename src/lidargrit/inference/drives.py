@@ -15,10 +15,11 @@ from torch import Tensor
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError, DataError
-from lidargrit.data.datasets import ScanDataset, open_dataset
+from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.drives import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import KittiTree, ScanFolder
+from lidargrit.data.sources import open_source
 from lidargrit.data.trajectories import read_trajectory
 from lidargrit.data.windows import TimedScan, drives_in
 from lidargrit.generation.conditions.past import PastTold
@@ -102,7 +103,7 @@ def continued(drive: str, sensor: SensorModel, frames: int, after: int | None, c
         after: number of the last scan that is seen, from 0; the last one of the drive if not given.
         constant_speed: whether later poses of the drive are left alone. Where it has none, the last step is repeated.
     """
-    dataset = open_dataset(drive)
+    dataset = open_source(drive).scans()
     scans = [TimedScan(dataset.name(at), dataset.recording(at), dataset.motion(at)) for at in range(len(dataset))]
     numbers = max(drives_in(scans), key=lambda one: (len(one) > 1, one[-1:]), default=[])
     last = len(numbers) - 1 if after is None else after

@@ -140,8 +140,8 @@ def sampling_settings(sampling: Any) -> list[SamplingSetting]:
     found = []
     for name, default in own_first(sampling).items():
         kind = hints[name]
-        if kind not in (int, float, int | None, float | None):
-            continue
+        if name == "batch_size" or kind not in (int, float, int | None, float | None):
+            continue  # a client does not choose how much memory a batch takes
         whole = kind in (int, int | None)
         at_most = max(_WHOLE_AT_MOST if whole else _FRACTION_AT_MOST, default or 0)
         found.append(SamplingSetting(name, whole, default, at_most, _about(type(sampling), name)))

@@ -13,6 +13,7 @@ from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.scans.motion import Motion
 
 _FOLDERS_ABOVE = 3  # of velodyne_points/data/0000000000.bin, the drive
+_TUM_COLUMNS = 8  # time in s, x, y, z in m, and a quaternion
 
 
 def motion_beside(path: Path) -> Motion:
@@ -22,7 +23,8 @@ def motion_beside(path: Path) -> Motion:
     Times may also be those of ``timestamps.txt``, as KITTI raw has them.
     """
     for folder in path.parents[:_FOLDERS_ABOVE]:
-        if (folder / "times.txt").is_file() or (folder / "poses.txt").is_file():
+        has_poses = (folder / "poses.txt").is_file() and not _is_trajectory(folder / "poses.txt")
+        if has_poses or (folder / "times.txt").is_file():
             known = motions(folder)
             places = _places(path.parent, path.suffix)
             number = places.get(path.name, -1)
@@ -38,6 +40,13 @@ def time_beside(path: Path) -> float | None:
     times_s = _timestamps_s(path.parent.parent / "timestamps.txt")
     number = int(path.stem) if path.stem.isdecimal() else len(times_s)
     return float(times_s[number]) if number < len(times_s) else None
+
+
+@lru_cache(maxsize=64)
+def _is_trajectory(path: Path) -> bool:
+    """Return whether a file has TUM's rows of a time and a pose, which are of no scan in particular."""
+    rows = (row for row in read_text(path).splitlines() if row.strip() and not row.lstrip().startswith("#"))
+    return len(next(rows, "").split()) == _TUM_COLUMNS
 
 
 @lru_cache(maxsize=64)
