@@ -163,7 +163,7 @@ def constant_speed(past: Past, gap: int) -> Past:
 
 
 def _estimates(errors: Sequence[ForecastErrors]) -> dict[str, Estimate]:
-    columns = zip(*map(astuple, errors), strict=True)
+    columns = zip(*(astuple(one) for one in errors), strict=True)
     return {name: Estimate.of(column) for name, column in zip(ForecastErrors.names(), columns, strict=True)}
 
 
