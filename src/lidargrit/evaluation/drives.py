@@ -25,6 +25,7 @@ from lidargrit.evaluation.drive_errors import (
     forecast_errors,
 )
 from lidargrit.evaluation.intervals import Estimate
+from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.motion import transform_between
@@ -34,7 +35,7 @@ from lidargrit.scans.types import RangeImage
 from lidargrit.scans.warp import warp
 
 HORIZONS_S = (0.1, 0.5, 1.0, 3.0)
-_PAST_SCANS = 5
+_PAST_SCANS = PastTold.past_scans
 _STANDS_M_PER_S = 0.5  # below, a forecast is as good as the last scan
 _LONGEST_OFF = 0.25  # of a horizon, by which the nearest whole number of steps may miss it
 _TTCE_STEPS, _CTC_STEPS = (3, 4), (1, 2, 3, 4)
@@ -68,7 +69,7 @@ class _Drives:
             gap = max(1, round(horizon_s / period_s))
             if abs(gap * period_s - horizon_s) <= _LONGEST_OFF * horizon_s:
                 found += [(number, gap) for number in drive[gap + _PAST_SCANS - 1 :]]
-        return [found[at] for at in evenly_spaced(min(at_most or len(found), len(found)), len(found))]
+        return [found[at] for at in evenly_spaced(at_most or len(found), len(found))]
 
 
 def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple[str, dict[str, Any]]:
@@ -189,7 +190,7 @@ def evaluate_drives(sources: Sequence[str], config: EvalConfig) -> tuple[str, di
 def _fits(drives: _Drives, steps: int, at_most: int, measure: Measure) -> Estimate:
     """Return the mean over pairs of scans so many steps apart of what is measured of them."""
     pairs = [(one, later) for drive in drives.pasts.drives for one, later in zip(drive, drive[steps:], strict=False)]
-    chosen = [pairs[at] for at in evenly_spaced(min(at_most or len(pairs), len(pairs)), len(pairs))]
+    chosen = [pairs[at] for at in evenly_spaced(at_most or len(pairs), len(pairs))]
     values = []
     with reporting.progress(f"pairs {steps} apart", len(chosen)) as progress:
         for one, later in chosen:

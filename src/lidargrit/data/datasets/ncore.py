@@ -11,9 +11,9 @@ from jaxtyping import Float64
 
 from lidargrit.core.determinism import natural_order
 from lidargrit.core.errors import DataError
-from lidargrit.data.datasets import Motion
 from lidargrit.data.datasets.shared.library import LibraryDataset
 from lidargrit.data.formats import BadPoints, scan_of
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.types import Scan
 
 if TYPE_CHECKING:

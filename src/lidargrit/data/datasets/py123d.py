@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from lidargrit.core.errors import DataError, ScanError
-from lidargrit.data.datasets import Motion
 from lidargrit.data.datasets.shared.library import LibraryDataset
 from lidargrit.data.formats import BadPoints, scan_of
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.types import Scan
 
 _MICROSECONDS = 1e6

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
 from lidargrit.core.errors import DataError, OutputError, ScanError
-from lidargrit.data.datasets import Motion
 from lidargrit.data.datasets.shared.files import FileDataset, hashed_name
 from lidargrit.data.formats import BadPoints
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.types import Scan
 
 
