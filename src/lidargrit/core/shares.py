@@ -46,7 +46,8 @@ def each_done(
         LidarGritError: what a share raised; no cluster answers, or workers died too often.
     """
     if ray:
-        yield from _by_ray(do, shares, ray, on_gpus)
+        with connected(ray):
+            yield from _by_ray(do, shares, on_gpus)
     elif min(workers, len(shares)) <= 1:
         yield from map(do, shares)
     else:
@@ -56,12 +57,15 @@ def each_done(
 
 @contextmanager
 def connected(address: str) -> "Iterator[None]":
-    """Keep one connection to a Ray cluster for all that :func:`each_done` does in the block; none without an address.
+    """Keep one connection to a Ray cluster for all that is done in the block; none without an address.
+
+    Within another such block, or where the caller has connected already, that connection is used and kept.
 
     Raises:
         LidarGritError: no cluster answers.
     """
-    if not address:
+    known = sys.modules.get("ray")
+    if not address or (known is not None and known.is_initialized()):
         yield
         return
     ray = _connect(address)
@@ -71,13 +75,8 @@ def connected(address: str) -> "Iterator[None]":
         ray.shutdown()
 
 
-def _by_ray(do: Callable[[Share], Result], shares: Sequence[Share], address: str, on_gpus: bool) -> Iterator[Result]:
-    ray = sys.modules.get("ray")
-    if ray is None or not ray.is_initialized():
-        with connected(address):
-            yield from _by_ray(do, shares, address, on_gpus)
-        return
-    heard = set[str]()
+def _by_ray(do: Callable[[Share], Result], shares: Sequence[Share], on_gpus: bool) -> Iterator[Result]:
+    ray, heard = import_module("ray"), set[str]()
     try:
         needs = {"num_gpus": 1} if on_gpus and ray.cluster_resources().get("GPU") else {}
         task = ray.remote(num_cpus=1, max_retries=_RETRIES, **needs)(_done_in)
