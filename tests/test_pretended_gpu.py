@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from functools import partial
+from unittest.mock import patch
 
 import pytest
 import torch
 
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.generator import load_class
+from lidargrit.generation.pixel_decoder import pixel_decoder
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
@@ -128,14 +130,14 @@ def test_no_recorded_step_of_tokens_waits_for_the_device(small: LidarGrit) -> No
 
 
 STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: kernels, reads and uploads at most
-    "completion/completion": (1130, 22, 2),
+    "completion/completion": (1030, 4, 3),
     "dusty/adversarial": (670, 1, 0),
-    "lidargan/adversarial": (640, 22, 6),
+    "lidargan/adversarial": (640, 4, 6),
     "lidargen/score": (2070, 0, 0),
     "lidargrit/tokenizer": (720, 0, 0),
     "lidargrit/transformer": (115, 0, 0),
     "lidargrit/pixels": (1110, 0, 0),
-    "lidarvae/autoencoder": (310, 11, 3),
+    "lidarvae/autoencoder": (310, 2, 3),
     "lidm/tokenizer": (690, 0, 0),
     "lidm/denoiser": (690, 0, 0),
     "maskgit/tokenizer": (720, 0, 0),
@@ -145,6 +147,17 @@ STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: ker
     "r2dm/diffusion": (570, 0, 0),
     "r2flow/flow": (880, 0, 0),
 }
+
+
+def test_levels_of_a_pyramid_choose_their_phases_by_one_source_of_random_numbers() -> None:
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+    cls = load_class("pyramid")
+    objective = cls(cls.smallest_config(sensor), sensor).objective("levels")
+    with patch.object(pixel_decoder, "one_of_phases", wraps=pixel_decoder.one_of_phases) as choose, counted():
+        objective.to(DEVICE)(Example(uniform_images(sensor, 8)).to(DEVICE), PretendedGenerator().manual_seed(0))
+    sources = [call.args[1] for call in choose.call_args_list]
+    assert len(sources) > 1
+    assert all(source is sources[0] for source in sources), "levels would choose alike"
 
 
 @pytest.mark.parametrize("stage", STEPS)
