@@ -7,10 +7,12 @@ from unittest.mock import patch
 import pytest
 import torch
 
+from lidargrit.core.errors import ConfigError
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.pixel_decoder import pixel_decoder
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import TransformerConfig
@@ -20,6 +22,7 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling, sample_token
 from lidargrit.training.compute import uniform_images
+from lidargrit.training.stage import begin_training
 from pretended_gpu import DEVICE, Counts, PretendedGenerator, counted
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
@@ -182,3 +185,17 @@ def test_a_step_of_training_asks_no_more_of_the_device_than_is_known(stage: str)
     assert totals(counts)[0] > 50
     for found, at_most in zip(totals(counts), STEPS[stage], strict=True):
         assert found <= at_most, str(counts)
+
+
+def test_too_little_memory_is_told_in_one_line_with_a_setting_that_takes_less(small: LidarGrit) -> None:
+    full = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total of 8 GiB.")
+    cures = {32: "use sampling.batch_size=16", 1: "use another device"}
+    for size, cure in cures.items():
+        with patch.object(small, "_sample", side_effect=full), pytest.raises(ConfigError, match=cure) as error:
+            small.sample([0], sampling=TokenSampling(batch_size=size))
+        assert error.value.got.startswith(f"{size} scans at once (CUDA out of memory)")
+    objective = load_class("r2dm")(load_class("r2dm").smallest_config(SENSOR), SENSOR).objective("diffusion")
+    engine, _ = begin_training(objective, TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3))
+    for parts, cure in {2: "accumulate=4", 4: "recompute=true"}.items():
+        with patch.object(type(objective), "forward", side_effect=full), pytest.raises(ConfigError, match=cure):
+            engine.step(Example(uniform_images(SENSOR, 4)), 0, 1.0, parts)
