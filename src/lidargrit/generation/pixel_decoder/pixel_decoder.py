@@ -62,17 +62,17 @@ class PixelSampling(SamplingSettings):
         range_noise: multiplier of the components' scales; 1 takes them as they are.
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
             so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
-        point: whether nothing is left to chance: pixels return that probably do, at the median range.
         precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
             ``auto`` is ``bf16`` where the machine has instructions for it; ``tf32`` rounds what a GPU multiplies to 11
             digits.
+        point: whether nothing is left to chance: pixels return that probably do, at the median range.
     """
 
     range_temperature: Temperature = 0.0
     range_noise: Annotated[float, Bounds(above=0, most=_NOISE_AT_MOST)] = 0.7
     mask_correlation: Weight = 2.0
-    point: bool = False
     precision: Precision = "fp32"
+    point: bool = False
 
 
 class PixelNll(NamedTuple):
