@@ -47,8 +47,6 @@ _HEAD = ("forecast", "L1 [m]", "AbsRel", "median [m]", "covered", "mask right", 
 
 @dataclass(frozen=True, eq=False)
 class _Drives:
-    """Range images of one source with their drives."""
-
     images: RangeImages
     pasts: Pasts
 

@@ -150,7 +150,6 @@ def write_drives(
 
     Args:
         run_folder: folder that the generator was read from.
-        seeds: seed of each drive.
         first: generator of a drive's first scan, where none is seen before it; the same one if not given.
         facts: entries of the manifest by which the ways are told from others.
 
@@ -184,7 +183,6 @@ class _Drive:
 
     Args:
         opening: generator of a scan before which there is none.
-        folder: folder of its sequence.
     """
 
     def __init__(
@@ -200,7 +198,6 @@ class _Drive:
         self._files = [folder / "velodyne" / f"{frame:06d}.bin" for frame in range(len(way.poses))]
 
     def write(self, progress: reporting.Progress) -> None:
-        """Write those scans that are not there."""
         way, missing = self._way, [not file.exists() for file in self._files]
         if not any(missing):
             return

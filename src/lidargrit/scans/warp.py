@@ -121,7 +121,7 @@ class _Rays(NamedTuple):
 
     Args:
         fine: directions of all pixels of an image with all fine columns: x, y and z.
-        fine32: the same in 32 bits.
+        fine32: directions of the same pixels in 32 bits.
         kept: directions of the pixels of an image.
         edge_sine: sines of the elevations at which rows end, rising.
         first_rad: azimuth of the first pixel of each row.
