@@ -107,9 +107,7 @@ def chamfer_m2(one_m: Float64[np.ndarray, "n 3"], other_m: Float64[np.ndarray, "
     return float(((forth**2).mean() + (back**2).mean()) / 2)
 
 
-def gem_errors(
-    forecast_m: Float64[Tensor, "H W"], true_m: Float64[Tensor, "H W"], sensor: SensorModel
-) -> GemErrors:
+def gem_errors(forecast_m: Float64[Tensor, "H W"], true_m: Float64[Tensor, "H W"], sensor: SensorModel) -> GemErrors:
     """Compare a forecast with the scan that came as GEM's program does; ranges are in metres, 0 where nothing returns.
 
     Points lie on the upper and first edges of their pixels.

@@ -14,8 +14,8 @@ gem = Protocol(
     departures=(
         "a fault of the program, kept: a pixel without a return is a point at the sensor in both clouds, a perfect "
         "match where both have any; the column beside it leaves these points out",
-        "a fault of the program, kept: it moves points above +3 and below -25 degrees into its outer rows, and compares "
-        "with images, not with the scans",
+        "a fault of the program, kept: it moves points above +3 and below -25 degrees into its outer rows, and "
+        "compares with images, not with the scans",
         "the program scores the first 500 scans of each drive, each as often as one of its windows forecasts it; here "
         "every scan with five before it, once at each horizon",
         "the program's past are five scans as far apart as the forecasts are; here five in a row",
