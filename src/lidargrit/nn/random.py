@@ -12,6 +12,14 @@ def rngs_of(seeds: Sequence[int]) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in seeds]
 
 
+def of_host(rng: torch.Generator) -> torch.Generator:
+    """Return a source of random numbers whose values the host knows without waiting for a device.
+
+    Ask for it once a step, and hand it on: of a device's source each call begins with the same numbers.
+    """
+    return rng if rng.device.type == "cpu" else torch.Generator().manual_seed(rng.initial_seed())
+
+
 def normal_latents(seeds: Sequence[int], *size: int) -> Float[Tensor, "B *size"]:
     """Sample standard normal numbers of this size for each seed, on the CPU."""
     return torch.stack([torch.randn(size, generator=rng) for rng in rngs_of(seeds)])

@@ -19,7 +19,6 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     Phase,
     at_phases,
     join_phases,
-    of_host,
     one_of_phases,
 )
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
@@ -27,6 +26,7 @@ from lidargrit.generation.pixel_decoder.ray_encoding import with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
+from lidargrit.nn.random import of_host
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.planes import planes_of
 from lidargrit.scans.sensors import SensorModel
