@@ -20,6 +20,7 @@ from lidargrit.data.sources.sample_formats import (
     read_tensor,
     read_tensor_folder,
     recognise,
+    samples_in,
     sensor_of_tensors,
 )
 from lidargrit.scans.projection import project, unproject
@@ -84,8 +85,15 @@ def write_r3dpa(path, scans):
 
 
 def test_the_archive_of_r3dpa_is_read_scan_by_scan(tmp_path):
+    whole, tmp_path = tmp_path, tmp_path / "numpy"
+    tmp_path.mkdir()
     write_r3dpa(tmp_path / "img.npz", [scan(seed)[0].numpy() for seed in (1, 2, 3)])
     (tmp_path / "samples.pcd").write_bytes(b"a pickle")
+    assert len(open_images(str(whole))) == len(open_images(str(tmp_path / "img.npz"))) == 3
+    (whole / "pcd").mkdir()
+    write_lidm(whole / "pcd" / "000000.txt", scan(0)[0])
+    assert samples_in(whole) == tmp_path
+    assert samples_in(whole / "pcd") == whole / "pcd"
     assert recognise(tmp_path) == "r3dpa"
     images = open_images(str(tmp_path))
     assert len(images) == 3

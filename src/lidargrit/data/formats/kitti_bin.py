@@ -83,4 +83,4 @@ def _is_padded(start: bytes, size: int) -> bool:
     if size % _PADDED_BYTES:
         return False
     rows = np.frombuffer(start, "<f4", len(start) // _PADDED_BYTES * 5).reshape(-1, 5)
-    return not rows[:, 3:].any() and bool(rows[:, :3].any(axis=0).all())
+    return not (rows[:, 3:] != 0).any() and bool((rows[:, :3] != 0).any(axis=0).all())

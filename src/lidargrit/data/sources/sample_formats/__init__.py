@@ -108,6 +108,18 @@ def is_tensor_folder(folder: Path) -> bool:
         return False
 
 
+def samples_in(path: Path) -> Path | None:
+    """Return the folder in which a path holds samples of another program, or None if it holds none.
+
+    R3DPA writes pictures, an archive and text into three folders, LiDM pictures and text into two.
+    """
+    if path.name == "img.npz" and _holds_images_of_r3dpa(path.parent):
+        return path.parent
+    if not path.is_dir():
+        return None
+    return next((each for each in (path, path / "numpy", path / "pcd") if is_tensor_folder(each)), None)
+
+
 def recognise(folder: Path) -> str:
     """Name the program that wrote a folder of samples, by its text or archive, or the channels of the first tensor."""
     if _holds_points_without_colour(folder):
