@@ -44,9 +44,9 @@ class GemErrors:
     """GEM's Chamfer distances of the forecast of one scan, in square metres, and what its fault does to them.
 
     Args:
-        chamfer_m2: of all pixels; one without a return is a point at the sensor.
-        inner_m2: the same of points in the box, in which the sensor lies.
-        returns_m2: of returns alone.
+        chamfer_m2: distance of the points of all pixels; one without a return is a point at the sensor.
+        inner_m2: distance of those in the box, in which the sensor lies.
+        returns_m2: distance of returns alone.
         drops: share of pixels of the true scan without a return.
     """
 

@@ -173,7 +173,7 @@ class ReferenceFile:
         missing = [each for each in kept.metrics if each.why_not]
         named = ", ".join(f"{each.metric} ({each.variant})" for each in kept.metrics if not each.why_not)
         lines = [
-            f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB of sums over {counted_scans(kept.set.scans_used)} of "
+            f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB, sums over {counted_scans(kept.set.scans_used)} of "
             f"{kept.set.source}, which it does not hold; protocol {kept.protocol}; sha256 {self.sha256}",
             f"holds: {named}",
             *(f"not held: {each.metric} ({each.variant}): {each.why_not}" for each in missing),
