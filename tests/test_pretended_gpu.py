@@ -15,6 +15,7 @@ from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.nn.random import SeededNoise
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.scans.condition import NOTHING
 from lidargrit.scans.example import Example
@@ -150,6 +151,17 @@ STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: ker
     "r2dm/diffusion": (570, 0, 0),
     "r2flow/flow": (880, 0, 0),
 }
+
+
+def test_noise_is_made_on_the_device_and_is_that_of_the_cpu() -> None:
+    here = SeededNoise([3, 7], (2, 8, 6), torch.device("cpu"))
+    with counted() as counts:
+        there = SeededNoise([3, 7], (2, 8, 6), DEVICE)
+        images = [there(), there.uniform(), there()]
+    assert totals(counts)[1:] == (0, 1), f"the seeds, once:\n{counts}"
+    for image, wanted in zip(images, (here(), here.uniform(), here()), strict=True):
+        with counted():
+            assert torch.equal(image.cpu(), wanted)
 
 
 def test_levels_of_a_pyramid_choose_their_phases_by_one_source_of_random_numbers() -> None:

@@ -259,7 +259,6 @@ def _folder_name(system: str) -> str:
 
 
 def _share(processes: int) -> None:
-    """Give this process its share of the machine's cores."""
     torch.set_num_threads(max(1, torch.get_num_threads() // processes))
 
 

@@ -77,8 +77,6 @@ MEASURED = {
 
 @dataclass(frozen=True, eq=False)
 class _Drives:
-    """Range images of one source with their drives."""
-
     images: RangeImages
     pasts: Pasts
 

@@ -82,9 +82,6 @@ def within_memory(scans: int, cure: str) -> Iterator[None]:
     Args:
         scans: number of scans that are computed at once.
         cure: setting that takes less memory.
-
-    Raises:
-        ConfigError: the memory did not suffice.
     """
     try:
         yield

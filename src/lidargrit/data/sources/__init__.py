@@ -32,11 +32,7 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
 class DatasetSource(Source):
-    """Scans of a data set: files in a known layout, or simulated scans.
-
-    Args:
-        bad_points: treatment of NaN, infinite and origin points.
-    """
+    """Scans of a data set: files in a known layout, or simulated scans."""
 
     kind, has_points = "scans", True
 

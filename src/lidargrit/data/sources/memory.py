@@ -48,7 +48,6 @@ class CutSource(Source):
     """The scans of a data set, each without what lies behind the first points of its file.
 
     Args:
-        source: source of the scans.
         num_points: largest number of points of a scan.
     """
 
@@ -96,8 +95,6 @@ def _imaged(scan: Callable[[int], Scan], count: int, sensor: SensorModel, config
 
 
 class _Images:
-    """Range images in memory as a store."""
-
     provenance = Provenance()
 
     def __init__(self, images: Sequence[RangeImage]) -> None:
@@ -107,6 +104,5 @@ class _Images:
         return len(self._images)
 
     def read(self, index: int) -> Pixels:
-        """Return the pixels of one image."""
         image = self._images[index]
         return Pixels(image.range_m.numpy(), {name: pixels.numpy() for name, pixels in image.planes.items()})

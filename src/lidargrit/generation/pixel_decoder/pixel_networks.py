@@ -329,7 +329,6 @@ class MaskNetwork(PhaseNetwork):
         Args:
             guide: output of the decoder for every pixel.
             uniform: random numbers in [0, 1): independent ones, or those that ``noise`` makes of them.
-            condition: observed part of the scans, whose returns are kept as they are.
         """
         guided = self.guided(guide)
         mask = condition.return_mask & condition.return_observed

@@ -113,8 +113,6 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
         """Return scans whose finest levels are sampled given the true coarser ones, which tell what these keep.
 
         Args:
-            images: true scans.
-            seeds: seed of each scan.
             levels: number of levels that are sampled.
         """
         every, made = levels_of(self.levels), []
