@@ -102,6 +102,7 @@ def test_of_clouds_the_first_26000_points_alone_are_scored(tmp_path):
     wanted = divergence_root(*sums)
     card, _ = compare_sources(*sets, settings)
     assert any("the first 26,000 points alone" in warning for warning in card.warnings)
+    assert "both have scans of" in compare_sources(sets[0], sets[0], settings)[0].leak
     assert card.scores[0].result.value == pytest.approx(wanted, abs=2e-4), "prepared ranges are rounded to 2 mm"
     in_memory = lidargrit.evaluate(
         read["samples"], read["real"], "lidarcrafter", ["bev_jsd"], sensor=load_sensor("hdl32e_nuscenes")
@@ -155,12 +156,13 @@ def test_samples_of_opendwm_are_turned_have_no_rings_and_are_told_to_be_voxels(t
     kitti = (
         tmp_path / "kitti_360" / "pred_voxel_data_3d_raw" / "2013_05_28_drive_0000_sync" / "velodyne_points" / "data"
     )
-    for number in range(2):
-        corners = corners_of_opendwm(ground_and_walls(number))
+    clouds = [corners_of_opendwm(ground_and_walls(number)) for number in range(2)]
+    for number, corners in enumerate(clouds):
         padded = np.concatenate([corners, np.zeros((len(corners), 2), np.float32)], axis=-1)
         for where, name in ((folder, f"n015__LIDAR_TOP__{number}.pcd.bin"), (kitti, f"{number:010}.bin")):
             where.mkdir(parents=True, exist_ok=True)
             padded.tofile(where / name)
+    corners = clouds[1]
     near = np.linalg.norm(corners, axis=1) >= 1
     read = formats.read_scan(folder / "n015__LIDAR_TOP__1.pcd.bin")
     assert read.ring is None
@@ -175,7 +177,7 @@ def test_samples_of_opendwm_are_turned_have_no_rings_and_are_told_to_be_voxels(t
         xyz, laser = street(number)
         rows = np.column_stack((-xyz[:, 1], xyz[:, 0], xyz[:, 2], np.ones(len(xyz)), 31 - laser))
         rows.astype(np.float32).tofile(tmp_path / "real" / f"{number}.pcd.bin")
-    card = compare_sources(str(tmp_path / "nuscenes"), str(tmp_path / "real"), settings)[0]
+    card, _ = compare_sources(str(tmp_path / "nuscenes"), str(tmp_path / "real"), settings)
     assert sum("lie on a grid of 0.125 m: voxels, not" in warning for warning in card.warnings) == 1
     assert card.samples.projection.startswith("spherical")
     assert card.reference.projection.startswith("spherical"), "both by elevation, since one has no rings"
