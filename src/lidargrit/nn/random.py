@@ -70,7 +70,7 @@ def philox(counter: Sequence[Words], key: Sequence[Words]) -> Int64[Tensor, "4 .
 
     Args:
         counter: four words of 32 bits, numbers or tensors whose shapes broadcast.
-        key: two words of it.
+        key: two words of 32 bits.
 
     Source:
         Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, SC 2011; its constants.
