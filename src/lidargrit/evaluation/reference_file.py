@@ -165,8 +165,8 @@ class ReferenceFile:
         missing = [each for each in kept.metrics if each.why_not]
         named = ", ".join(f"{each.metric} ({each.variant})" for each in kept.metrics if not each.why_not)
         lines = [
-            f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB of {counted_scans(kept.set.scans_used)} of "
-            f"{kept.set.source}, and none of them; protocol {kept.protocol}; sha256 {self.sha256}",
+            f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB, sums over {counted_scans(kept.set.scans_used)} of "
+            f"{kept.set.source}, which it does not hold; protocol {kept.protocol}; sha256 {self.sha256}",
             f"holds: {named}",
             *(f"not held: {each.metric} ({each.variant}): {each.why_not}" for each in missing),
             f"score with: lidargrit evaluate SAMPLES {self.path} --protocol {kept.protocol}",

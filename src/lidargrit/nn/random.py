@@ -69,8 +69,8 @@ def philox(counter: Sequence[Words], key: Sequence[Words]) -> Int64[Tensor, "4 .
     """Return four random words of 32 bits for each counter and key: Philox 4x32-10.
 
     Args:
-        counter: its four words of 32 bits, numbers or tensors whose shapes broadcast.
-        key: its two words.
+        counter: four words of 32 bits, numbers or tensors whose shapes broadcast.
+        key: two words of 32 bits.
 
     Source:
         Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, SC 2011; its constants.
