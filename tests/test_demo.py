@@ -7,22 +7,23 @@ from lidargrit.data.datasets import load
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.settings import Preset
 from lidargrit.systems.lidargrit.system import TokenSampling
+from lidargrit.training.measure import Measured
 from lidargrit.viewer import demo
 
 
-def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys):
+def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys, monkeypatch):
+    stage = Measured("transformer", 1, 1.0, 12.5, "cpu", 0.5)  # a measurement itself takes half a minute
+    monkeypatch.setattr(demo, "measure", lambda preset: [stage])
+
     def chosen(*settings: str, data: str | None = None, anew: bool = False) -> tuple[Preset, str, str]:
         with reporting.to(reporting.TerminalReporter()):
             preset = demo._preset(data, [*settings], anew)
         return preset, demo.how_trained(preset), capsys.readouterr().err
 
     preset, words, said = chosen()
-    assert [*demo._expected_s(preset, simulates=True)] == [
-        "projecting scans",
-        "training transformer",
-        "sampling",
-        "scoring",
-    ]
+    expected_s = demo._expected_s(preset, simulates=True)
+    assert [*expected_s] == ["projecting scans", "training transformer", "sampling", "scoring"]
+    assert expected_s["training transformer"] == 12.5
     assert words.startswith("The tokenizer and the pixel decoder come as trained, from the model in the package")
     assert words.endswith("The transformer learns further here, from the weights of that model.")
     assert said == ""

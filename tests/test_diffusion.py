@@ -7,8 +7,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
-from lidargrit.nn.random import SeededNoise
+from lidargrit.nn.random import SeededNoise, philox
 from lidargrit.systems.r2dm.diffusion import (
     alpha_sigma,
     log_snr_at,
@@ -167,6 +168,33 @@ def test_completion_agrees_with_what_was_observed_and_draws_the_rest_given_it():
     # RePaint is not exact; more resamples bring it nearer. These bounds hold what was found, 0.03 and a quarter.
     assert float((drawn[:, 4:].mean(0) - torch.from_numpy(mean)).abs().max()) < 0.05
     assert np.sqrt(np.diag(np.cov(drawn[:, 4:].T.numpy()))) == pytest.approx(np.sqrt(np.diag(spread)), rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("counter", "key", "words"),
+    [
+        ((0,) * 4, (0,) * 2, (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((2**32 - 1,) * 4, (2**32 - 1,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+        (
+            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+            (0xA4093822, 0x299F31D0),
+            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+        ),
+    ],
+)
+def test_philox_gives_the_known_answers_of_its_authors(counter, key, words):
+    tensors = [tuple(torch.tensor(number) for number in numbers) for numbers in (counter, key)]
+    for found in (philox(counter, key), philox(*tensors)):
+        assert tuple(found.tolist()) == words
+
+
+def test_noise_is_standard_normal_and_uniform():
+    noise = SeededNoise(range(4), (2, 64, 129), torch.device("cpu"))
+    normal, uniform = noise(), noise.uniform()
+    assert stats.kstest(normal.flatten().numpy(), "norm").pvalue > 0.01
+    assert stats.kstest(uniform.flatten().numpy(), "uniform").pvalue > 0.01
+    together = torch.cat((normal.flatten(1), noise().flatten(1)))
+    assert np.abs(np.corrcoef(together.numpy()) - np.eye(8)).max() < 0.05
 
 
 def test_each_seed_has_its_own_noise():

@@ -18,6 +18,7 @@ from lidargrit.evaluation.drive_errors import (
     consistency_chamfer_m2,
     consistency_error_m,
     forecast_errors,
+    gem_errors,
     registered,
 )
 from lidargrit.evaluation.drives import baselines, constant_speed, evaluate_forecast
@@ -69,6 +70,36 @@ def test_a_forecast_of_nothing_and_a_perfect_one_have_the_errors_that_they_shoul
     assert (nothing.l1_m, nothing.abs_rel, nothing.covered, nothing.mask_right) == (10, 1, 0, 0)
     assert math.isnan(nothing.median_m)
     assert chamfer_m2(np.zeros((0, 3)), np.ones((2, 3))) == 0
+
+
+def points_of_gem(range_m: np.ndarray) -> np.ndarray:
+    """Points as to_xyz writes them, pixel by pixel: on the upper and first edges, at the sensor without a return."""
+    height, width = range_m.shape
+    points = []
+    for row, column in np.ndindex(height, width):
+        pitch, yaw = math.radians(3 - 28 * row / height), math.radians(180 - 360 * column / width)
+        flat = range_m[row, column] * math.cos(pitch)
+        points.append((flat * math.cos(yaw), flat * math.sin(yaw), range_m[row, column] * math.sin(pitch)))
+    return np.array(points)
+
+
+@pytest.mark.parametrize(("true_drops", "forecast_drops"), [(0.2, 0.3), (0, 0.3), (0.2, 0), (0.2, 1), (1, 0.2)])
+def test_gems_chamfer_distance_is_that_of_all_pixels_with_drops_at_the_sensor(true_drops, forecast_drops):
+    rng = np.random.default_rng(2)
+    rows = torch.deg2rad(3 - 28 * (torch.arange(8) + 0.5) / 8)[:, None]
+    few = SensorModel("few", rows, column_azimuths_rad(32), 1.45, 80.0, "spherical")
+    true, forecast = rng.uniform(2, 79, (2, 8, 32))
+    true[rng.random((8, 32)) < true_drops], forecast[rng.random((8, 32)) < forecast_drops] = 0, 0
+    found = gem_errors(torch.from_numpy(forecast), torch.from_numpy(true), few)
+    clouds = [points_of_gem(range_m) for range_m in (forecast, true)]
+    assert found.chamfer_m2 == pytest.approx(slow_chamfer_m2(*clouds))
+    inner = [cloud[np.all(np.abs(cloud) <= (70, 70, 4.5), axis=1)] for cloud in clouds]
+    assert found.inner_m2 == pytest.approx(slow_chamfer_m2(*inner))
+    alone = [cloud[np.linalg.norm(cloud, axis=1) > 0] for cloud in clouds]
+    assert found.returns_m2 == pytest.approx(slow_chamfer_m2(*alone) if all(map(len, alone)) else 0)
+    assert found.drops == (true == 0).mean()
+    if (true_drops, forecast_drops) == (0.2, 0.3):
+        assert found.chamfer_m2 < 0.9 * found.returns_m2, "what the fault is worth"
 
 
 def room(count: int = 1500) -> np.ndarray:

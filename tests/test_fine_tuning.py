@@ -49,7 +49,7 @@ def test_images_of_another_sensor_of_64_rows_are_as_wide_as_the_models():
     assert columns_like(own, load_sensor("pandar64"))[0] % own.width == 0
 
 
-@pytest.mark.parametrize("sensor", ["vlp16", "hdl32e", "os1_128"])
+@pytest.mark.parametrize("sensor", ["vlp16", "os1_128"])
 def test_scans_of_other_rows_are_refused_with_a_command_that_plans_a_training(sensor, capsys):
     with pytest.raises(ConfigError, match=f"scans of {load_sensor(sensor).height} rows") as refused:
         fine_tuning_preset("simulated:8:train", sensor)

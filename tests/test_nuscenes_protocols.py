@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 import lidargrit
+from lidargrit.data import formats
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.sample_formats import load_sample_format, read_tensor_folder
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources
@@ -100,6 +102,7 @@ def test_of_clouds_the_first_26000_points_alone_are_scored(tmp_path):
     wanted = divergence_root(*sums)
     card, _ = compare_sources(*sets, settings)
     assert any("the first 26,000 points alone" in warning for warning in card.warnings)
+    assert "both have scans of" in compare_sources(sets[0], sets[0], settings)[0].leak
     assert card.scores[0].result.value == pytest.approx(wanted, abs=2e-4), "prepared ranges are rounded to 2 mm"
     in_memory = lidargrit.evaluate(
         read["samples"], read["real"], "lidarcrafter", ["bev_jsd"], sensor=load_sensor("hdl32e_nuscenes")
@@ -130,6 +133,56 @@ def test_samples_of_lidarcrafter_are_read(tmp_path):
     assert "LiDARCrafter" in load_sample_format("r2dm").title
 
 
+def corners_of_opendwm(cloud):
+    """Points as OpenDWM's voxels2points and postprocess_points write them, in the sensor's frame (x right), float32."""
+    turn = Rotation.from_euler("zyx", (-89.9, 0.6, -0.3), degrees=True).as_matrix()  # like the sensor's on the car
+    low, cell = np.array([-50.0, -50, -3]), np.array([0.15625, 0.15625, 0.125])
+    in_car = cloud @ turn.T + (0.94, 0, 1.84)
+    voxels = np.unique(np.floor((in_car - low) / cell), axis=0)
+    corners = voxels[np.all((voxels >= 0) & (voxels < (640, 640, 64)), axis=1)] * cell + low
+    return ((corners - (0.94, 0, 1.84)) @ turn).astype(np.float32)
+
+
+def ground_and_walls(seed):
+    """A cloud in nuScenes' axes, dense enough for neighbouring voxels; the right half has a wall at 12 m, x right."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack((*rng.uniform(-40, 40, (2, 20000)), np.full(20000, -1.8)))
+    wall = np.column_stack((np.full(20000, 12.0), rng.uniform(-30, 30, 20000), rng.uniform(-1.8, 2, 20000)))
+    return np.concatenate((ground, wall))
+
+
+def test_samples_of_opendwm_are_turned_have_no_rings_and_are_told_to_be_voxels(tmp_path):
+    folder = tmp_path / "nuscenes" / "pred_voxel_samples" / "LIDAR_TOP"
+    kitti = (
+        tmp_path / "kitti_360" / "pred_voxel_data_3d_raw" / "2013_05_28_drive_0000_sync" / "velodyne_points" / "data"
+    )
+    clouds = [corners_of_opendwm(ground_and_walls(number)) for number in range(2)]
+    for number, corners in enumerate(clouds):
+        padded = np.concatenate([corners, np.zeros((len(corners), 2), np.float32)], axis=-1)
+        for where, name in ((folder, f"n015__LIDAR_TOP__{number}.pcd.bin"), (kitti, f"{number:010}.bin")):
+            where.mkdir(parents=True, exist_ok=True)
+            padded.tofile(where / name)
+    corners = clouds[1]
+    near = np.linalg.norm(corners, axis=1) >= 1
+    read = formats.read_scan(folder / "n015__LIDAR_TOP__1.pcd.bin")
+    assert read.ring is None
+    np.testing.assert_array_equal(read.points_xyz_m, (corners @ [[0, -1, 0], [1, 0, 0], [0, 0, 1]])[near])
+    as_kitti = formats.read_scan(kitti / "0000000001.bin")
+    np.testing.assert_array_equal(as_kitti.points_xyz_m, corners)
+    assert as_kitti.reflectance is None
+    assert grid_of_points_m(read.points_xyz_m) == pytest.approx(0.125)
+    settings = EvalConfig("fair_nuscenes", ("bev_jsd",), resampling=Resampling(halves=0), data=DataConfig(workers=1))
+    for number in range(2):
+        (tmp_path / "real").mkdir(exist_ok=True)
+        xyz, laser = street(number)
+        rows = np.column_stack((-xyz[:, 1], xyz[:, 0], xyz[:, 2], np.ones(len(xyz)), 31 - laser))
+        rows.astype(np.float32).tofile(tmp_path / "real" / f"{number}.pcd.bin")
+    card, _ = compare_sources(str(tmp_path / "nuscenes"), str(tmp_path / "real"), settings)
+    assert sum("lie on a grid of 0.125 m: voxels, not" in warning for warning in card.warnings) == 1
+    assert card.samples.projection.startswith("spherical")
+    assert card.reference.projection.startswith("spherical"), "both by elevation, since one has no rings"
+
+
 def test_centres_of_voxels_are_told_beside_the_score(tmp_path):
     cloud = street(1)[0]
     voxels = np.unique((np.floor(cloud / 0.2) + 0.5).astype(np.float32) * np.float32(0.2), axis=0)
@@ -142,6 +195,6 @@ def test_centres_of_voxels_are_told_beside_the_score(tmp_path):
             np.savez(tmp_path / name / f"{number}.npz", points)
     settings = EvalConfig("lidarcrafter", ("bev_jsd",), resampling=Resampling(halves=0), data=DataConfig(workers=1))
     told = compare_sources(str(tmp_path / "voxels"), str(tmp_path / "clouds"), settings)[0].warnings
-    assert sum("lie on a grid of 0.2 m: centres of voxels" in warning for warning in told) == 1
+    assert sum("lie on a grid of 0.2 m: voxels, not" in warning for warning in told) == 1
     same = compare_sources(str(tmp_path / "clouds"), str(tmp_path / "clouds"), settings)[0].warnings
     assert not any("voxels, not" in warning for warning in same)

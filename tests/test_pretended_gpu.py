@@ -2,15 +2,20 @@
 
 from dataclasses import replace
 from functools import partial
+from unittest.mock import patch
 
 import pytest
 import torch
 
+from lidargrit.core.errors import ConfigError
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.generator import load_class
+from lidargrit.generation.pixel_decoder import pixel_decoder
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder
+from lidargrit.nn.random import SeededNoise
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.scans.condition import NOTHING
 from lidargrit.scans.example import Example
@@ -18,6 +23,7 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling, sample_token
 from lidargrit.training.compute import uniform_images
+from lidargrit.training.stage import begin_training
 from pretended_gpu import DEVICE, Counts, PretendedGenerator, counted
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
@@ -128,14 +134,14 @@ def test_no_recorded_step_of_tokens_waits_for_the_device(small: LidarGrit) -> No
 
 
 STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: kernels, reads and uploads at most
-    "completion/completion": (1130, 22, 2),
+    "completion/completion": (1030, 4, 3),
     "dusty/adversarial": (670, 1, 0),
-    "lidargan/adversarial": (640, 22, 6),
+    "lidargan/adversarial": (640, 4, 6),
     "lidargen/score": (2070, 0, 0),
     "lidargrit/tokenizer": (720, 0, 0),
     "lidargrit/transformer": (115, 0, 0),
     "lidargrit/pixels": (1110, 0, 0),
-    "lidarvae/autoencoder": (310, 11, 3),
+    "lidarvae/autoencoder": (310, 2, 3),
     "lidm/tokenizer": (690, 0, 0),
     "lidm/denoiser": (690, 0, 0),
     "maskgit/tokenizer": (720, 0, 0),
@@ -145,6 +151,28 @@ STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: ker
     "r2dm/diffusion": (570, 0, 0),
     "r2flow/flow": (880, 0, 0),
 }
+
+
+def test_noise_is_made_on_the_device_and_is_that_of_the_cpu() -> None:
+    here = SeededNoise([3, 7], (2, 8, 6), torch.device("cpu"))
+    with counted() as counts:
+        there = SeededNoise([3, 7], (2, 8, 6), DEVICE)
+        images = [there(), there.uniform(), there()]
+    assert totals(counts)[1:] == (0, 1), f"the seeds, once:\n{counts}"
+    for image, wanted in zip(images, (here(), here.uniform(), here()), strict=True):
+        with counted():
+            assert torch.equal(image.cpu(), wanted)
+
+
+def test_levels_of_a_pyramid_choose_their_phases_by_one_source_of_random_numbers() -> None:
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(32)
+    cls = load_class("pyramid")
+    objective = cls(cls.smallest_config(sensor), sensor).objective("levels")
+    with patch.object(pixel_decoder, "one_of_phases", wraps=pixel_decoder.one_of_phases) as choose, counted():
+        objective.to(DEVICE)(Example(uniform_images(sensor, 8)).to(DEVICE), PretendedGenerator().manual_seed(0))
+    sources = [call.args[1] for call in choose.call_args_list]
+    assert len(sources) > 1
+    assert all(source is sources[0] for source in sources), "levels would choose alike"
 
 
 @pytest.mark.parametrize("stage", STEPS)
@@ -169,3 +197,17 @@ def test_a_step_of_training_asks_no_more_of_the_device_than_is_known(stage: str)
     assert totals(counts)[0] > 50
     for found, at_most in zip(totals(counts), STEPS[stage], strict=True):
         assert found <= at_most, str(counts)
+
+
+def test_too_little_memory_is_told_in_one_line_with_a_setting_that_takes_less(small: LidarGrit) -> None:
+    full = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total of 8 GiB.")
+    cures = {32: "use sampling.batch_size=16", 1: "use another device"}
+    for size, cure in cures.items():
+        with patch.object(small, "_sample", side_effect=full), pytest.raises(ConfigError, match=cure) as error:
+            small.sample([0], sampling=TokenSampling(batch_size=size))
+        assert error.value.got.startswith(f"{size} scans at once (CUDA out of memory)")
+    objective = load_class("r2dm")(load_class("r2dm").smallest_config(SENSOR), SENSOR).objective("diffusion")
+    engine, _ = begin_training(objective, TrainingConfig(scans=4, batch_size=4, learning_rate=1e-3))
+    for parts, cure in {2: "accumulate=4", 4: "recompute=true"}.items():
+        with patch.object(type(objective), "forward", side_effect=full), pytest.raises(ConfigError, match=cure):
+            engine.step(Example(uniform_images(SENSOR, 4)), 0, 1.0, parts)

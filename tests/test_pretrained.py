@@ -22,6 +22,7 @@ from lidargrit.inference.segment import open_segmenter
 from lidargrit.inference.segment.command import LabelScores
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
+from lidargrit.systems.lidargrit.system import LidarGrit
 from lidargrit.training.compute import uniform_images
 from lidargrit.viewer.serve import finished_runs
 from tiny_runs import the_one_line
@@ -169,6 +170,7 @@ def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
 
 def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(LidarGrit, "own_batches", (1, 1))  # else eight scans are computed for one
     assert main(["view", "pretrained", "-n", "1", "-o", "page.html"]) == 0
     few = ["--reference", "simulated:2:test", "-n", "2", "--metrics", "bev_jsd"]
     assert main(["compare", "table", "pretrained", *few]) == 0

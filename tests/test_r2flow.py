@@ -140,7 +140,7 @@ def test_a_pair_ends_at_what_a_file_keeps_of_the_generated_scan(golden):
 
 
 def test_later_trainings_straighten_and_distil_the_flow():
-    pairs = ReflowConfig(pairs=4, distilled_steps=2, distilled_pairs=4, solving=FlowSampling(steps=4))
+    pairs = ReflowConfig(pairs=4, distilled_steps=2, distilled_pairs=4, pair_steps=4)
     generator, images = stirred(made(reflectance=False, reflow=pairs)), walls(2, reflectance=False)
     assert generator.stages == ("flow", "reflow", "distillation")
     for stage in generator.stages[1:]:

@@ -20,6 +20,7 @@ from lidargrit.data.sources.sample_formats import (
     read_tensor,
     read_tensor_folder,
     recognise,
+    samples_in,
     sensor_of_tensors,
 )
 from lidargrit.scans.projection import project, unproject
@@ -77,6 +78,40 @@ def test_clouds_on_the_edges_of_pixels_keep_their_pixels(tmp_path):
     assert int(plainly.return_mask.sum()) < 0.8 * len(points), "what a projection of these points would lose"
 
 
+def write_r3dpa(path, scans):
+    """Write img.npz as postprocess and create_npz_from_sample_folder do: depth, x, y, z, and zeros for reflectance."""
+    depth = np.stack([np.where(range_m > 0, range_m, 0.3) for range_m in scans])[:, None].astype(np.float32)
+    np.savez(path, arr_0=np.hstack([depth, np.ones_like(depth), -depth, depth, np.zeros_like(depth)]))
+
+
+def test_the_archive_of_r3dpa_is_read_scan_by_scan(tmp_path):
+    whole, tmp_path = tmp_path, tmp_path / "numpy"
+    tmp_path.mkdir()
+    write_r3dpa(tmp_path / "img.npz", [scan(seed)[0].numpy() for seed in (1, 2, 3)])
+    (tmp_path / "samples.pcd").write_bytes(b"a pickle")
+    assert len(open_images(str(whole))) == len(open_images(str(tmp_path / "img.npz"))) == 3
+    (whole / "pcd").mkdir()
+    write_lidm(whole / "pcd" / "000000.txt", scan(0)[0])
+    assert samples_in(whole) == tmp_path
+    assert samples_in(whole / "pcd") == whole / "pcd"
+    assert recognise(tmp_path) == "r3dpa"
+    images = open_images(str(tmp_path))
+    assert len(images) == 3
+    assert images.sensor.name == "hdl64e_kitti_360"
+    batch = images.batch([0, 1, 2])
+    for index, seed in enumerate((1, 2, 3)):
+        range_m = scan(seed)[0]
+        assert torch.equal(batch.range_m[index], torch.where(range_m < 56, range_m, 0))
+    assert batch.reflectance is None
+    np.savez_compressed(tmp_path / "img.npz", arr_0=np.zeros((1, 5, 64, 1024), np.float32))
+    with pytest.raises(ScanError, match="a packed array"):
+        read_tensor_folder(tmp_path, "r3dpa")
+    write_r3dpa(tmp_path / "img.npz", [scan(1)[0].numpy()])
+    (tmp_path / "img.npz").write_bytes((tmp_path / "img.npz").read_bytes()[:700_000])
+    with pytest.raises(ScanError, match="which cannot be used"):
+        read_tensor_folder(tmp_path, "r3dpa")
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
@@ -93,7 +128,7 @@ def test_other_text_is_refused_in_one_line(text, line, tmp_path):
 
 
 def test_every_sample_format_is_tested():
-    assert sorted([*WRITERS, "lidm"]) == discovery.names("sample-formats")
+    assert sorted([*WRITERS, "lidm", "r3dpa"]) == discovery.names("sample-formats")
     for name in discovery.names("sample-formats"):
         assert load_sample_format(name).source
         assert 20 < len(discovery.summary("sample-formats", name)) < 180

@@ -75,7 +75,7 @@ def test_noise_on_walls_is_that_of_chi_squared_distributions():
     figures = StreetFigures.of([street(0.02, seed=seed) for seed in range(4)])
     rows_cm, columns_cm = (figures.pooled[f"{name}, walls"] for name in ("noise along a row", "10 rows of a column"))
     assert rows_cm < 2 * math.sqrt(chi2.ppf(0.25, 6) / 8)  # where a wall is struck at an angle, it is less
-    expected = np.quantile(np.concatenate([slow_columns(street(0.02, seed=seed)) for seed in range(4)]), 0.25)
+    expected = np.quantile(np.concatenate([column_distances_m(street(0.02, seed=seed)) for seed in range(4)]), 0.25)
     assert math.isclose(columns_cm, 100 * expected, rel_tol=1e-5)
     assert math.isclose(columns_cm, 2 * math.sqrt(chi2.ppf(0.25, 8) / 10), rel_tol=0.05)
     twice = StreetFigures.of([street(0.04, seed=seed) for seed in range(4)]).pooled["noise along a row, walls"]

@@ -240,11 +240,10 @@ def test_sizes_that_cannot_be_halved_are_refused():
         replace(SMALL, channels=20)
 
 
-@pytest.mark.parametrize("name", ["raydrop_weight", "reflectance_weight"])
 @pytest.mark.parametrize("wrong", [-0.1, float("nan")])
-def test_negative_weights_of_the_loss_are_refused(name, wrong):
-    with pytest.raises(ConfigError, match=f"{name}={wrong}; wanted a number, at least 0"):
-        VqvaeConfig(**{name: wrong})
+def test_a_negative_weight_of_the_loss_is_refused(wrong):
+    with pytest.raises(ConfigError, match=f"raydrop_weight={wrong}; wanted a number, at least 0"):
+        VqvaeConfig(raydrop_weight=wrong)
 
 
 def test_cells_may_have_fewer_columns_than_rows():

@@ -125,7 +125,6 @@ def build_parser() -> Parser:
 
 
 def _parsed(parser: Parser, words: list[str]) -> argparse.Namespace:
-    """Parse the words of a command, or raise UsageError."""
     options, too_many = parser.parse_known_args(words)
     if too_many:
         (options.words if options.verb else parser).refuse(too_many[0])

@@ -54,7 +54,6 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
 
 
 def _systems(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
-    """Return the systems to compare, and what they have in common."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.data.prepared.config import DataConfig
     from lidargrit.evaluation.benchmark import Benchmark

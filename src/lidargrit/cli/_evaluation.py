@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 _OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
 _OF_REFERENCE = ("samples", "protocol", "count", "device", *SCANS)
+_OF_FORECASTS = ("forecast", "gem")
+_OF_DRIVES = (*_OF_FORECASTS, "drive")
 _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
@@ -26,7 +28,7 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
 
-    if public_name(options.protocol) in ("forecast", "drive"):
+    if public_name(options.protocol) in _OF_DRIVES:
         return *_of_drives(options), None
     names = ("protocol", "device", *_OF_CARDS)
     config = read_config(
@@ -67,8 +69,8 @@ def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
             "no drives", "their folder or source", "name it, as in lidargrit evaluate DRIVES --protocol drive"
         )
     used = ("samples", "protocol", "count", "device", *SCANS)
-    if public_name(options.protocol) == "forecast":
-        refuse_unused(options, "with --protocol forecast", (*used, "model"))
+    if public_name(options.protocol) in _OF_FORECASTS:
+        refuse_unused(options, f"with --protocol {options.protocol}", (*used, "model"))
         return evaluate_forecast(options.samples, config, options.model)
     refuse_unused(options, "with --protocol drive", (*used, "reference"))
     return evaluate_drives([*filter(None, (options.samples, options.reference))], config)

@@ -137,7 +137,6 @@ class Parser(argparse.ArgumentParser):
         return []
 
     def _wanted(self) -> str:
-        """Return the command with the names of its required arguments."""
         needed = [action for action in self._actions if action.required]
         shown = [[*action.option_strings[:1], str(action.metavar or action.dest).upper()] for action in needed]
         return " ".join([self.prog, *(word for words in shown for word in words)])

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--protocol", default="exact", metavar="NAME", help="metrics and definitions: lidargrit list protocols")
     add("--metrics", nargs="+", default=[], metavar="NAME", help="others than its: lidargrit list metrics")
     add("--variant", default="", metavar="NAME", help="published definition of every metric")
-    add("--samples-format", default="", metavar="NAME", help="program of .pth files: r2dm, lidargen or lidargrit")
+    add("--samples-format", default="", metavar="NAME", help="program that wrote them: lidargrit list sample-formats")
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
     add_count(parser, help="largest number of scans; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="half-samples for 95 %% intervals; 0 for none")

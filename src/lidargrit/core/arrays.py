@@ -5,6 +5,7 @@ import struct
 import warnings
 import zipfile
 from io import BufferedReader, BytesIO
+from pathlib import Path
 
 import numpy as np
 
@@ -103,6 +104,29 @@ def read_member(
     except Exception as error:  # a damaged archive is met with errors of many kinds
         raise ValueError(f"a damaged array ({first_words(error)})") from None
     return parse_array(data, may_have_fields)
+
+
+def mapped_member(path: Path, name: str) -> np.ndarray:
+    """Return one array of an archive that packs nothing; its numbers are read from disk when they are asked for.
+
+    Raises:
+        ValueError: no such array, a packed or damaged one, or other numbers than floating-point ones.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive, path.open("rb") as file:
+            info = archive.getinfo(f"{name}.npy")
+            if info.compress_type != zipfile.ZIP_STORED:
+                raise ValueError("a packed array, of which no part can be read alone")
+            file.seek(info.header_offset + 26)  # lengths of the name and of what follows it
+            start = info.header_offset + 30 + sum(struct.unpack("<HH", file.read(4)))
+            file.seek(start)
+            head = BytesIO(file.read(2 * HEADER_BYTES_AT_MOST))
+        shape, by_column, dtype = parse_header(head)
+        if by_column or dtype.kind != "f" or not all(type(size) is int and size >= 0 for size in shape):
+            raise ValueError(f"an array of {ascii(dtype)[:40]} and shape {str(shape)[:60]}")
+        return np.memmap(path, dtype, "c", start + head.tell(), shape)
+    except Exception as error:  # a damaged archive is met with errors of many kinds
+        raise ValueError(first_words(error)) from None
 
 
 def member_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:

@@ -89,9 +89,6 @@ def override(
         owner: name of what has these settings, for a message.
         cure: hint on how to find the names of the settings, for a message.
         fixed: names of fields that are no settings.
-
-    Raises:
-        ConfigError: an unknown name (names its nearest neighbours) or a value of another type.
     """
     known = {name: value for name, value in leaves(config).items() if name not in fixed}
     values: dict[str, Any] = {}

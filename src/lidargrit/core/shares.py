@@ -60,9 +60,6 @@ def connected(address: str) -> "Iterator[None]":
     """Keep one connection to a Ray cluster for all that is done in the block; none without an address.
 
     Within another such block, or where the caller has connected already, that connection is used and kept.
-
-    Raises:
-        LidarGritError: no cluster answers.
     """
     known = sys.modules.get("ray")
     if not address or (known is not None and known.is_initialized()):
@@ -105,8 +102,6 @@ def _by_ray(do: Callable[[Share], Result], shares: Sequence[Share], on_gpus: boo
 
 
 class _Notes(reporting.Reporter):
-    """Keeps what is reported."""
-
     def __init__(self) -> None:
         self.told: list[str] = []
 
@@ -130,7 +125,6 @@ def _done_in(folder: str, do: Callable[[Share], Result], share: Share) -> tuple[
 
 
 def _connect(address: str) -> "ModuleType":
-    """Connect to a cluster, and return the library."""
     if address != "auto":
         _refuse_silent(address)
     try:

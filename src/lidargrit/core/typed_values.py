@@ -109,11 +109,7 @@ def check(hint: Any, value: Any, name: str) -> None:
 
 
 def from_word(hint: Any, word: str, name: str) -> Any:
-    """Return the value that a user wrote as a word; a tuple is ``a,b`` or ``[a, 'b, c']``, and None is ``null``.
-
-    Raises:
-        ConfigError: a word that does not fit the type.
-    """
+    """Return the value that a user wrote as a word; a tuple is ``a,b`` or ``[a, 'b, c']``, and None is ``null``."""
     value = None if word == "null" and fits(hint, None) else _parsed(bare(hint), word)
     if not fits(hint, value):
         raise _misfit(hint, word, name)

@@ -122,7 +122,6 @@ class _Changed:
         self._scans, self._change, self._told = scans, change, False
 
     def __call__(self, index: int) -> Scan:
-        """Return one scan after the work."""
         changed = self._change(self._scans.timed(index))
         if not self._told:
             reporting.message(f"{printable(changed.scan.source)}: {changed.told}")
@@ -150,7 +149,6 @@ class _Flat:
         self.keeps_labels = "label" in form.keeps
 
     def files(self, names: list[str]) -> list[str]:
-        """Return the file of every scan, below the folder."""
         return [name + self._suffix for name in names]
 
     def write(self, file: str, scan: Scan) -> None:

@@ -20,9 +20,6 @@ class Pasts:
     Args:
         images: range images whose sources have all fine columns, and times and poses of some.
         scans: number of past scans, K.
-
-    Raises:
-        DataError: no image that follows another in a drive.
     """
 
     def __init__(self, images: RangeImages, scans: int) -> None:

@@ -230,6 +230,5 @@ def _each_name(written: Iterable[object]) -> Iterator[object]:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Return a name without the digits at its end, and these digits."""
     stem = name.rstrip(string.digits)
     return stem, name[len(stem) :]

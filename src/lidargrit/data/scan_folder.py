@@ -131,7 +131,6 @@ class ScanFolder:
             write_json(path, sensor.to_json())
 
     def _claim(self) -> None:
-        """Write the manifest, or add to the one that is there."""
         scans = self._facts["scans"]
         for file in scans:
             parts = PurePosixPath(file).parts

@@ -259,7 +259,6 @@ def _folder_name(system: str) -> str:
 
 
 def _share(processes: int) -> None:
-    """Give this process its share of the machine's cores."""
     torch.set_num_threads(max(1, torch.get_num_threads() // processes))
 
 
@@ -321,7 +320,8 @@ class _Plan:
     def of(cls, system: str, folder: Path, benchmark: Benchmark) -> "_Plan":
         if system.endswith(_SCORES):
             path, taken = Path(system), folder / _folder_name(system) / f"{_folder_name(system)}{_SCORES}"
-            return cls(system, path, None, None, None, card=Scorecard.read(path if path.is_file() else taken))
+            there = taken if taken.is_file() and not path.is_file() else path
+            return cls(system, path, None, None, None, card=Scorecard.read(there))
         name, settings = name_and_settings(system)
         run, trained = locate(name), folder / "runs" / name
         if is_run(run):

@@ -246,9 +246,6 @@ def save_reference(scans: str, path: Path, settings: EvalConfig) -> ReferenceFil
     """Write all that metrics keep of real scans into a file, by which others score samples without these scans.
 
     The file holds no scan. Metrics that the user named are kept at any size, those of the protocol up to a limit.
-
-    Raises:
-        LidarGritError: not one metric could be fed; the reason of the first.
     """
     usable_device(settings.device)
     protocol, config = load_protocol(settings.protocol), settings.data_config()
@@ -355,7 +352,6 @@ def metric_factory(choice: MetricChoice, settings: EvalConfig) -> MetricFactory:
 
 
 def _doubts(scores: Sequence[Score], settings: EvalConfig) -> list[str]:
-    """Return warnings about the scores themselves."""
     found = []
     if settings.resampling.halves and any(score.interval is None for score in scores):
         without = [score.result.metric for score in scores if score.interval is None]

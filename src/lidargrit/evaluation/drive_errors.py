@@ -1,6 +1,7 @@
 """Scans of a drive → how far a forecast of one is off, and how well scans that follow one another fit together."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -37,10 +38,25 @@ class ForecastErrors:
     mask_right: float
     chamfer_m2: float
 
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the names of all errors."""
-        return tuple(each.name for each in fields(cls))
+
+@dataclass(frozen=True)
+class GemErrors:
+    """GEM's Chamfer distances of the forecast of one scan, in square metres, and what its fault does to them.
+
+    Args:
+        chamfer_m2: distance of the points of all pixels; one without a return is a point at the sensor.
+        inner_m2: distance of those in the box, in which the sensor lies.
+        returns_m2: distance of returns alone.
+        drops: share of pixels of the true scan without a return.
+    """
+
+    chamfer_m2: float
+    inner_m2: float
+    returns_m2: float
+    drops: float
+
+
+ErrorsOfForecast = ForecastErrors | GemErrors
 
 
 def in_box(points_m: Float64[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
@@ -89,6 +105,45 @@ def chamfer_m2(one_m: Float64[np.ndarray, "n 3"], other_m: Float64[np.ndarray, "
         return 0.0
     forth, back = KDTree(other_m).query(one_m)[0], KDTree(one_m).query(other_m)[0]
     return float(((forth**2).mean() + (back**2).mean()) / 2)
+
+
+def gem_errors(forecast_m: Float64[Tensor, "H W"], true_m: Float64[Tensor, "H W"], sensor: SensorModel) -> GemErrors:
+    """Compare a forecast with the scan that came as GEM's program does; ranges are in metres, 0 where nothing returns.
+
+    Points lie on the upper and first edges of their pixels.
+
+    Source:
+        wuyang98/GEM@6fa73eb, evaluation_utils.py: compute_chamfer_distance and compute_chamfer_distance_inner, of the
+        files that generate_and_save.py and vae/precompute_lidar.py write.
+    """
+    elevation, azimuth = sensor.elevation_rad.double().numpy(), sensor.azimuth_rad.double().numpy()
+    elevation = elevation + (elevation[0] - elevation[-1]) / (len(elevation) - 1) / 2
+    azimuth = azimuth + np.pi / sensor.width
+    flat = np.cos(elevation)
+    rays = np.stack(np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=-1)
+    images_m = forecast_m.numpy(), true_m.numpy()
+    returns = [image_m[image_m > 0][:, None] * rays[image_m > 0] for image_m in images_m]
+    drops = [image_m.size - len(points) for image_m, points in zip(images_m, returns, strict=True)]
+    inner = [points[in_box(points)] for points in returns]
+    chamfer, alone = _chamfers_with_and_without_drops_m2(returns, drops)
+    return GemErrors(chamfer, _chamfers_with_and_without_drops_m2(inner, drops)[0], alone, drops[1] / true_m.numel())
+
+
+def _chamfers_with_and_without_drops_m2(
+    points_m: Sequence[Float64[np.ndarray, "_ 3"]], drops: Sequence[int]
+) -> tuple[float, float]:
+    """Return the Chamfer distance of two clouds with so many points at the sensor each, and that without these."""
+    if not all(len(points) + count for points, count in zip(points_m, drops, strict=True)):
+        return 0.0, 0.0  # as the program, where the box holds nothing
+    with_drops, without = [], []
+    for one, other, own_drops, other_drops in zip(points_m, points_m[::-1], drops, drops[::-1], strict=True):
+        square = KDTree(other).query(one)[0] ** 2  # infinite where there is no other
+        without.append(float(square.mean()) if len(one) and len(other) else 0.0)
+        to_sensor = 0.0 if other_drops else float((other**2).sum(axis=1).min())
+        if other_drops:
+            square = np.minimum(square, (one**2).sum(axis=1))
+        with_drops.append(float((square.sum() + own_drops * to_sensor) / (len(one) + own_drops)))
+    return sum(with_drops) / 2, sum(without) / 2
 
 
 def registered(

@@ -1,7 +1,7 @@
 """Drives → tables: errors of forecasts of their scans, and how well scans that follow one another fit together."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, dataclass, fields, replace
 from statistics import median
 from typing import Any
 
@@ -19,34 +19,64 @@ from lidargrit.data.pasts import Pasts
 from lidargrit.data.sources import open_source
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.drive_errors import (
-    ForecastErrors,
+    ErrorsOfForecast,
     consistency_chamfer_m2,
     consistency_error_m,
     forecast_errors,
+    gem_errors,
 )
 from lidargrit.evaluation.intervals import Estimate
+from lidargrit.evaluation.protocols import load_protocol, public_name
 from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import points_of_pixels
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.scans.warp import warp
 
-HORIZONS_S = (0.1, 0.5, 1.0, 3.0)
 _PAST_SCANS = PastTold.past_scans
 _STANDS_M_PER_S = 0.5  # below, a forecast is as good as the last scan
 _LONGEST_OFF = 0.25  # of a horizon, by which the nearest whole number of steps may miss it
 _TTCE_STEPS, _CTC_STEPS = (3, 4), (1, 2, 3, 4)
 Measure = Callable[[np.ndarray, np.ndarray, np.ndarray], float]  # of an earlier and a later scan, and their transform
-_HEAD = ("forecast", "L1 [m]", "AbsRel", "median [m]", "covered", "mask right", "chamfer [m2]")
+ErrorsOf = Callable[[Float64[Tensor, "H W"], Float64[Tensor, "H W"], SensorModel], ErrorsOfForecast]
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """What a protocol measures of forecasts.
+
+    Args:
+        horizons_s: groups of seconds ahead; errors are means over all of a group.
+        errors: function from a forecast, the scan that came and their sensor to errors.
+        heads: titles of the errors.
+    """
+
+    horizons_s: tuple[tuple[float, ...], ...]
+    errors: ErrorsOf
+    heads: tuple[str, ...]
+
+
+MEASURED = {
+    "forecast": _Measured(
+        ((0.1,), (0.5,), (1.0,), (3.0,)),
+        forecast_errors,
+        ("L1 [m]", "AbsRel", "median [m]", "covered", "mask right", "chamfer [m2]"),
+    ),
+    "gem": _Measured(
+        ((0.2, 0.4, 0.6, 0.8, 1.0), (0.6, 1.2, 1.8, 2.4, 3.0)),
+        gem_errors,
+        ("chamfer, drops matched [m2]", "the same in its box [m2]", "returns alone [m2]", "drops"),
+    ),
+}
+"""Protocols of forecasts, by their names."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Drives:
-    """Range images of one source with their drives."""
-
     images: RangeImages
     pasts: Pasts
 
@@ -54,7 +84,8 @@ class _Drives:
     def of(cls, text: str, config: EvalConfig, model: Generator | None = None) -> "_Drives":
         source = open_source(text, config.data.bad_points)
         data = replace(config.data_config(), max_scans=0)
-        named = replace(data, sensor=config.sensor).load_sensor() if config.sensor else None
+        name = config.sensor or load_protocol(config.protocol).sensor
+        named = replace(data, sensor=name).load_sensor() if name else None
         images = source.images(model.sensor if model else named, source.as_projected(data))
         return cls(images, Pasts(images, _PAST_SCANS))
 
@@ -87,10 +118,12 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
     """
     generator = _forecaster(model, config.device) if model else None
     drives = _Drives.of(source, config, generator)
-    tables, values = [], []
-    for horizon_s in HORIZONS_S:
-        errors, standing = _errors_at(drives, horizon_s, config.max_scans, generator, model)
-        title, count = f"{horizon_s:g} s ahead", len(next(iter(errors.values()), []))
+    named = public_name(config.protocol)
+    measured, tables, values = MEASURED[named], [], []
+    for horizons_s in measured.horizons_s:
+        errors, standing = _errors_at(drives, horizons_s, config.max_scans, measured.errors, generator, model)
+        title = f"{', '.join(f'{each:g}' for each in horizons_s)} s ahead"
+        count = len(next(iter(errors.values()), []))
         if not count:
             lacking = f"{title}: no drive of {source} moves and is so long, with {_PAST_SCANS} scans before"
             tables.append(Table(sentences=(lacking,)))
@@ -98,14 +131,17 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
         rows = {name: _estimates(each) for name, each in errors.items()}
         left_out = (f"{standing} scans of a standing car are left out",) if standing else ()
         cells = tuple((name, *(each.as_text(".3f") for each in row.values())) for name, row in rows.items())
-        tables.append(Table(_HEAD, cells, f"{title}: {count} scans", notes=left_out))
+        tables.append(Table(("forecast", *measured.heads), cells, f"{title}: {count} scans", notes=left_out))
         plain = {name: {key: vars(each) for key, each in row.items()} for name, row in rows.items()}
-        values.append({"horizon_s": horizon_s, "scans": count, "standing": standing, "forecasts": plain})
+        at = {"horizon_s": horizons_s[-1], "horizons_s": list(horizons_s)}
+        values.append({**at, "scans": count, "standing": standing, "forecasts": plain})
     if not values:
         cure = "name longer ones: lidargrit simulate DRIVES --frames 12 -n 120"
         raise DataError(f"drives of {source} of which none moves for {_PAST_SCANS + 1} scans", "longer drives", cure)
-    about = {"protocol": "forecast", "samples": source, "model": model, "settings": config.facts()}
-    return render(tables), {**about, "horizons": values}
+    departures = load_protocol(named).departures
+    tables.append(Table(sentences=tuple(f"differs from its source: {each}" for each in departures)))
+    about = {"protocol": named, "samples": source, "model": model, "settings": config.facts()}
+    return render(tables), {**about, "departures": list(departures), "horizons": values}
 
 
 def _forecaster(model: str, device: str) -> Generator:
@@ -117,12 +153,17 @@ def _forecaster(model: str, device: str) -> Generator:
 
 
 def _errors_at(
-    drives: _Drives, horizon_s: float, at_most: int, generator: Generator | None, model: str
-) -> tuple[Mapping[str, list[ForecastErrors]], int]:
-    """Return the errors of every forecast at one horizon, and how many scans of a standing car were left out."""
-    found, standing = dict[str, list[ForecastErrors]](), 0
-    windows = drives.windows(horizon_s, at_most)
-    with reporting.progress(f"forecasting {horizon_s:g} s", len(windows)) as progress:
+    drives: _Drives,
+    horizons_s: Sequence[float],
+    at_most: int,
+    errors: ErrorsOf,
+    generator: Generator | None,
+    model: str,
+) -> tuple[Mapping[str, list[ErrorsOfForecast]], int]:
+    """Return the errors of every forecast at some horizons, and how many scans of a standing car were left out."""
+    found, standing = dict[str, list[ErrorsOfForecast]](), 0
+    windows = [window for horizon_s in horizons_s for window in drives.windows(horizon_s, at_most)]
+    with reporting.progress(f"forecasting {horizons_s[-1]:g} s", len(windows)) as progress:
         for number, gap in windows:
             past = drives.pasts.of([number], gaps=[gap])
             progress.advance(1)
@@ -135,7 +176,7 @@ def _errors_at(
                 made = generator.sample([scan_seed(0, number)], past)
                 forecasts[model] = made.range_m[0].double().cpu()
             for name, range_m in forecasts.items():
-                found.setdefault(name, []).append(forecast_errors(range_m, true_m, drives.images.sensor))
+                found.setdefault(name, []).append(errors(range_m, true_m, drives.images.sensor))
     return found, standing
 
 
@@ -163,9 +204,9 @@ def constant_speed(past: Past, gap: int) -> Past:
     return replace(past, transforms=torch.linalg.matrix_power(step, gap) @ to_latest)
 
 
-def _estimates(errors: Sequence[ForecastErrors]) -> dict[str, Estimate]:
+def _estimates(errors: Sequence[ErrorsOfForecast]) -> dict[str, Estimate]:
     columns = zip(*(astuple(one) for one in errors), strict=True)
-    return {name: Estimate.of(column) for name, column in zip(ForecastErrors.names(), columns, strict=True)}
+    return {each.name: Estimate.of(column) for each, column in zip(fields(errors[0]), columns, strict=True)}
 
 
 def evaluate_drives(sources: Sequence[str], config: EvalConfig) -> tuple[str, dict[str, Any]]:

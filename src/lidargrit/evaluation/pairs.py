@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from jaxtyping import Float
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from lidargrit.core.determinism import evenly_spaced
@@ -19,6 +20,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
 _BATCH = 16
+_SAME_SHARE, _OF_A_GRID_AT_LEAST = 1e-3, 0.05  # distances that differ by less are one; share of points that have it
 _POINTS_OF_A_GRID, _SAME_M, _GRID_M = 1000, 1e-3, 0.03  # voxels of generators are 10 to 20 cm wide
 
 
@@ -160,11 +162,12 @@ def paired(
     require_same_rays(first.images.sensor, reference.images.sensor)
     pair = EvalPair(first.as_set(len(reference), protocol.range_m), reference)
     warnings = (*_warnings(pair), *first.doubts, *doubts)
+    if len(drives := {*provenance.recordings} - {""}) == 1:
+        one = f"all scans of {reference.source} are of one drive ({drives.pop()})"
+        warnings = (*warnings, f"{one}: intervals tell of places along it, and nothing of other drives")
     if samples.has_points and (size_m := grid_of_points_m(samples.scans().scan(0).points_xyz_m)):
-        centres = (
-            f"the points of {samples.text} lie on a grid of {size_m:g} m: centres of voxels, not returns of rays; "
-        )
-        warnings = (*warnings, f"{centres}scores of edges, walls, rows and raydrop measure the grid")
+        voxels = f"the points of {samples.text} lie on a grid of {size_m:g} m: voxels, not returns of rays; "
+        warnings = (*warnings, f"{voxels}scores of edges, walls, rows and raydrop measure the grid")
     shared = overlap(samples, first.images, provenance)
     leak = f"{samples.text} and the reference overlap ({shared}): the scores flatter it" if shared else ""
     if reference.data_set == "samples" != samples.data_set:
@@ -269,13 +272,20 @@ def require_same_rays(generated: SensorModel, reference: SensorModel) -> None:
 
 
 def grid_of_points_m(points_xyz_m: Float[Tensor, "n 3"]) -> float:
-    """Return the spacing of the grid that points lie on, as centres of voxels do; 0 for points of rays.
+    """Return the spacing of the grid that points lie on, as corners or centres of voxels do; 0 for points of rays.
 
     It is the smallest distance of two coordinates along any axis that differ by more than a millimetre, if that is 3 cm
-    or more; real clouds of a thousand points have neighbours of millimetres along each axis.
+    or more; real clouds of a thousand points have neighbours of millimetres along each axis. In a grid that was turned,
+    as OpenDWM's is from the car's frame into the sensor's, it is the smallest distance of two points, if many are as
+    far from their nearest.
     """
     if len(points_xyz_m) < _POINTS_OF_A_GRID:
         return 0.0
     steps_m = [axis_m.unique().diff() for axis_m in points_xyz_m.double().T]
     smallest_m = min(float(steps[steps > _SAME_M].min()) if (steps > _SAME_M).any() else 0.0 for steps in steps_m)
+    if smallest_m < _GRID_M:
+        points = points_xyz_m.double().numpy()
+        nearest_m = KDTree(points).query(points, k=2)[0][:, 1]
+        smallest_m = float(nearest_m.min())
+        smallest_m *= float((nearest_m < smallest_m * (1 + _SAME_SHARE)).mean() > _OF_A_GRID_AT_LEAST)
     return round(smallest_m, 3) if smallest_m >= _GRID_M else 0.0

@@ -167,9 +167,7 @@ class StreetScans:
     """Streets that are simulated as the real scans beside them were recorded.
 
     Args:
-        seeds: seeds of the streets.
         firing: sensor that fires.
-        source: real scans.
         config: columns and projection of both, and their largest number.
     """
 

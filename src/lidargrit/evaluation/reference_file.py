@@ -92,11 +92,7 @@ class Contents:
 
 
 class ReferenceFile:
-    """A file that :func:`write_reference` wrote; arrays are read, and their hashes checked, when they are asked for.
-
-    Raises:
-        DataError: it is damaged, was altered, or is something else.
-    """
+    """A file that :func:`write_reference` wrote; arrays are read, and their hashes checked, when they are asked for."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -114,11 +110,7 @@ class ReferenceFile:
             raise DataError(f"{path}, which cannot be used ({reason})", _WANTED, _CURE) from None
 
     def pair_with(self, samples: Source, protocol: Protocol, config: DataConfig) -> EvalPair:
-        """Return samples and what is kept of the reference as the two sets of an evaluation.
-
-        Raises:
-            ConfigError: the file was made for another number of scans, or fewer samples.
-        """
+        """Return samples and what is kept of the reference as the two sets of an evaluation."""
         kept, count = self.contents, self.contents.set.scans_used
         at_most = protocol.scans_at_most(config.max_scans)
         if 0 < at_most < count:
@@ -173,8 +165,8 @@ class ReferenceFile:
         missing = [each for each in kept.metrics if each.why_not]
         named = ", ".join(f"{each.metric} ({each.variant})" for each in kept.metrics if not each.why_not)
         lines = [
-            f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB of {counted_scans(kept.set.scans_used)} of "
-            f"{kept.set.source}, and none of them; protocol {kept.protocol}; sha256 {self.sha256}",
+            f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB, sums over {counted_scans(kept.set.scans_used)} of "
+            f"{kept.set.source}, which it does not hold; protocol {kept.protocol}; sha256 {self.sha256}",
             f"holds: {named}",
             *(f"not held: {each.metric} ({each.variant}): {each.why_not}" for each in missing),
             f"score with: lidargrit evaluate SAMPLES {self.path} --protocol {kept.protocol}",

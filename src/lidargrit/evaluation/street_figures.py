@@ -121,8 +121,6 @@ class StreetFigures:
 
 @dataclass
 class _Gathered:
-    """Samples of each figure, scan by scan."""
-
     samples: dict[str, list[Float64[np.ndarray, "_"]]] = field(default_factory=dict)
     offsets_m: list[Float64[np.ndarray, "H"]] = field(default_factory=list)
 
@@ -155,7 +153,6 @@ def _surfaces(image: RangeImage) -> dict[str, Tensor]:
 
 
 def _returns(image: RangeImage) -> dict[str, Tensor]:
-    """Return the samples that tell which rays return, and from how far."""
     range_m = image.range_m[image.return_mask]
     first, last = (round(share * image.sensor.height) for share in _ROWS)
     return {

@@ -8,6 +8,7 @@ import numpy as np
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import SEED_AT_MOST
+from lidargrit.nn.size import within_memory
 from lidargrit.scans.condition import KINDS, Condition, ConditionKind, Nothing, Observed
 from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import SensorModel
@@ -40,11 +41,13 @@ def in_batches(seeds: Sequence[int], size: int, compute: Callable[[list[int], Ba
         compute: function from the indices and the seeds of a batch to its scans; those of the copies are dropped, and
             may be left out.
     """
-    parts = []
+    parts, halved = [], f"use sampling.batch_size={size // 2}" if size > 1 else "use another device"
     for first in range(0, len(seeds), size):
         wanted = range(first, min(first + size, len(seeds)))
         indices = [*wanted, *[wanted[-1]] * (size - len(wanted))]
-        parts.append(compute(indices, BatchSeeds([int(seeds[index]) for index in wanted], size))[: len(wanted)])
+        with within_memory(size, halved):
+            made = compute(indices, BatchSeeds([int(seeds[index]) for index in wanted], size))
+        parts.append(made[: len(wanted)])
     return RangeImage.cat(parts)
 
 

@@ -30,10 +30,6 @@ def located(
         token: the user's token; the one that the client has saved if not given.
         cache_dir: folder of the cache; the client's own if not given.
         local_files_only: whether to read the cache and ask nobody.
-
-    Raises:
-        CheckpointError: no such folder or repository, or the client is not installed or cannot reach it.
-        ConfigError: a revision of a folder, which has none.
     """
     here = named_folder(name)
     if here.is_dir():
@@ -67,11 +63,7 @@ def upload(
     branch: str | None,
     create_pr: bool | None,
 ) -> str:
-    """Upload the files of a folder, and return the address of the commit; the repository is made if it is missing.
-
-    Raises:
-        ConfigError: a name that no repository has, or the client is not installed or is refused.
-    """
+    """Upload the files of a folder, and return the address of the commit; the repository is made if it is missing."""
     hub = _client(repo_id, ConfigError)
     try:
         api = hub.HfApi(token=token)

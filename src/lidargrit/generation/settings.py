@@ -127,11 +127,7 @@ class Preset(Settings):
         return {stage: run for stage, run in self.start_runs.items() if self.training[stage].frozen}
 
     def settings_of(self, stage: str) -> TrainingConfig:
-        """Return the settings of a stage's training.
-
-        Raises:
-            ConfigError: the preset has none for this stage.
-        """
+        """Return the settings of a stage's training."""
         if stage not in self.training:
             raise ConfigError(
                 f"a preset without training.{stage}, a stage of model={self.generator}",

@@ -180,7 +180,6 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             wanted: number of scans to return; the rest are the copies of ``BatchSeeds``.
             mask: method by which returns and ranges are decided, checked by :meth:`check_choice`.
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
-            condition: observed part of the scans, which a pixel decoder keeps.
         """
         images = []
         at_once = _DECODED_AT_ONCE if tokens.device.type == "cpu" else len(tokens)

@@ -143,7 +143,6 @@ def write_drives(
 
     Args:
         run_folder: folder that the generator was read from.
-        seeds: seed of each drive.
         facts: entries of the manifest by which the ways are told from others.
 
     Returns:
@@ -168,11 +167,7 @@ def write_drives(
 
 
 class _Drive:
-    """Writes the scans of one drive.
-
-    Args:
-        folder: folder of its sequence.
-    """
+    """Writes the scans of one drive."""
 
     def __init__(
         self, generator: Generator[Any, SamplingT], way: Way, seed: int, folder: Path, sampling: SamplingT
@@ -181,7 +176,6 @@ class _Drive:
         self._files = [folder / "velodyne" / f"{frame:06d}.bin" for frame in range(len(way.poses))]
 
     def write(self, progress: reporting.Progress) -> None:
-        """Write those scans that are not there."""
         way, missing = self._way, [not file.exists() for file in self._files]
         if not any(missing):
             return

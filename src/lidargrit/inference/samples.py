@@ -165,7 +165,6 @@ def _trained_on(run_folder: Path) -> str | None:
 
 
 def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
-    """Return the seeds whose samples are not in a folder."""
     there = {entry.name for entry in os.scandir(folder)} if folder.exists() else set[str]()
     return [seed for seed in seeds if _file(folder, seed).name not in there]
 

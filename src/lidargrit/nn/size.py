@@ -1,10 +1,11 @@
-"""A bound on the size of a network, checked while the network is built: settings → a network, or an error."""
+"""Bounds on what is built and computed at once: settings → a network, a batch → what it gives, or an error."""
 
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
+import torch
 from torch import Tensor, nn
 from torch.nn.modules.module import (
     register_module_buffer_registration_hook,
@@ -70,3 +71,21 @@ def numbers_at_most(
     finally:
         for hook in hooks:
             hook.remove()
+
+
+@contextmanager
+def within_memory(scans: int, cure: str) -> Iterator[None]:
+    """Tell in one line that a GPU has no memory for what is computed within the ``with`` block.
+
+    The number of scans is not lowered in silence: a seed gives the same scan only in batches of one size.
+
+    Args:
+        scans: number of scans that are computed at once.
+        cure: setting that takes less memory.
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        torch.cuda.empty_cache()
+        reason = str(error).partition(". ")[0]
+        raise ConfigError(f"{scans} scans at once ({reason})", "what the GPU's memory holds", cure) from None

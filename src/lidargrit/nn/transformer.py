@@ -28,7 +28,6 @@ def attend(
     value: Float[Tensor, "B H T D"],
     *,
     causal: bool,
-    dropout: float = 0.0,
 ) -> Float[Tensor, "B H T D"]:
     """Return softmax(query key' / sqrt(D)) value, of one sequence with itself.
 
@@ -38,8 +37,8 @@ def attend(
     ``benchmarks/attention.py``).
     """
     length = query.shape[-2]
-    if query.dtype != torch.bfloat16 or query.device.type != "cpu" or length > _KEYS_AT_MOST or dropout:
-        return F.scaled_dot_product_attention(query, key, value, dropout_p=dropout, is_causal=causal)
+    if query.dtype != torch.bfloat16 or query.device.type != "cpu" or length > _KEYS_AT_MOST:
+        return F.scaled_dot_product_attention(query, key, value, is_causal=causal)
     query = query * query.shape[-1] ** -0.5
     mixed = []
     with without_autocast(query.device):  # it would compute the softmax, and keep its result, in 32 bits
@@ -67,7 +66,6 @@ class TransformerConfig(Settings):
         width: length of the vector that stands for a token.
         embedding_dropout: probability of dropout on the embedded tokens.
         residual_dropout: probability of dropout on the output of each block's two branches.
-        attention_dropout: probability of dropout on attention weights.
     """
 
     layers: Annotated[int, Bounds(1, _LAYERS_AT_MOST)] = 6
@@ -75,7 +73,6 @@ class TransformerConfig(Settings):
     width: Count = 256
     embedding_dropout: ShareBelow1 = 0.2
     residual_dropout: ShareBelow1 = 0.0
-    attention_dropout: ShareBelow1 = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -136,7 +133,7 @@ class MaskedTransformer(Transformer):
 class _Attention(nn.Module):
     def __init__(self, config: TransformerConfig, causal: bool) -> None:
         super().__init__()
-        self.heads, self.dropout, self.causal = config.heads, config.attention_dropout, causal
+        self.heads, self.causal = config.heads, causal
         self.key = nn.Linear(config.width, config.width)
         self.query = nn.Linear(config.width, config.width)
         self.value = nn.Linear(config.width, config.width)
@@ -146,8 +143,7 @@ class _Attention(nn.Module):
         q, k, v = (
             linear(x).unflatten(-1, (self.heads, -1)).transpose(1, 2) for linear in (self.query, self.key, self.value)
         )  # (B, heads, T, d)
-        dropout = self.dropout if self.training else 0.0
-        mixed = attend(q, k, v, causal=self.causal, dropout=dropout)
+        mixed = attend(q, k, v, causal=self.causal)
         return self.proj(mixed.transpose(1, 2).flatten(-2))
 
 

@@ -348,7 +348,6 @@ def _thrice(azimuth_rad: Float64[np.ndarray, " W"]) -> Float64[np.ndarray, " W*3
 
 
 def _part(pixels: tuple[np.ndarray, ...], chosen: Bool[np.ndarray, " n"]) -> tuple[np.ndarray, ...]:
-    """Return the rows and the columns of some of the pixels."""
     return tuple(axis[chosen] for axis in pixels)
 
 

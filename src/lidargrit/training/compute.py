@@ -213,7 +213,6 @@ def _cost_without_values(preset: Preset, generator: Generator, stage: str, senso
 
 
 def _cost_with_values(preset: Preset, generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
-    """Count the operations of a stage's training by computing some of its steps."""
     return _cost(generator.objective(stage), _uniform_examples(preset, sensor), torch.Generator)
 
 

@@ -19,6 +19,7 @@ from lidargrit.core.errors import ConfigError, LidarGritError, TrainingError
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.precision import Precision, dtype_of, products_in
+from lidargrit.nn.size import within_memory
 from lidargrit.scans.example import Example
 
 
@@ -120,8 +121,9 @@ class Engine:
         """
         self._objective.train()
         terms: dict[str, Tensor] = {}
+        several = f"training.*.accumulate={2 * parts}" if len(example) > parts else "training.*.recompute=true"
         for player in _turns(self._objective.objective):
-            with products_in(self._precision):
+            with products_in(self._precision), within_memory(len(example) // parts, f"use {several}"):
                 found, is_finite = self._step(example, seed, gradient_clip, player, parts)
             terms = _joined(terms, found, player)
             if not is_finite:

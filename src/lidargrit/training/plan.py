@@ -135,7 +135,6 @@ class CheckedStages:
 
         Args:
             setting: setting that names their sources, for the message.
-            images: training or validation images.
         """
         for name, objective in self.trained.items():
             try:

@@ -176,7 +176,6 @@ def _expected_s(preset: Preset, simulates: bool) -> dict[str, float]:
 
 
 def _score(samples: RangeImages, val: RangeImages) -> Scorecard:
-    """Score new scans against held-out scans, with both reference rows."""
     count = min(len(samples), len(val))
 
     def some(name: str, images: RangeImages) -> EvalSet:

@@ -183,7 +183,6 @@ def _followed_by(pixels: Tensor, beside: Scan | None, part: Literal["reflectance
 
 
 def _numbers_of_classes(scan_set: ScanSet) -> list[int]:
-    """Return the number of each class of a set, in their order."""
     label = scan_set.images.label
     if label is None:
         return []

@@ -54,7 +54,6 @@ def _systems(count: int) -> str:
 
 
 def _table(cards: Sequence[NamedCard], costs: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return what the template needs of systems that were compared with the same scans."""
     judged = judge(cards)
     inputs = {scans.source for _, card in cards for scans in (card.samples, card.reference)}
     told: dict[str, list[str]] = {}
@@ -86,7 +85,6 @@ def _table(cards: Sequence[NamedCard], costs: Mapping[str, dict[str, Any]]) -> d
 
 
 def _number(value: int | float | None) -> tuple[str, str]:
-    """Return a cost to sort by, and to read."""
     if value is None or not math.isfinite(value):
         return "", "-"
     return repr(value), f"{value:,}" if isinstance(value, int) and value < 1e9 else f"{value:.3g}"

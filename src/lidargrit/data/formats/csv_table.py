@@ -113,7 +113,6 @@ def _check_fields(body: bytes, at_most: int, separator: str, path: Path) -> None
 
 
 def _names(start: bytes) -> tuple[list[str], str]:
-    """Return the names in the first line, and what separates them."""
     line = start.partition(b"\n")[0].decode("latin1").removeprefix("\u00ef\u00bb\u00bf").strip()
     line = line.removeprefix("#").removeprefix("//").strip()  # numpy.savetxt and CloudCompare write them there
     separator = next((each for each in _SEPARATORS if each in line), ",")

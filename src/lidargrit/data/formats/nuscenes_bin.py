@@ -27,6 +27,7 @@ class NuscenesBin(BareRowFormat):
     up to a metre. Such points, and the car's own roof, are left out: points nearer than 1 m. nuScenes numbers the
     lasers from the lowest; ``ring`` counts from the highest. The motion correction moves near points of one ring up and
     down by a degree, so that ``--set data.projection=unfolding`` (rows by ring) assigns rows better than elevation.
+    Generators such as OpenDWM write the same rows with 0 for every laser: such points have no ring.
 
     Source:
         Caesar et al., nuScenes, CVPR 2020; its tools (nutonomy/nuscenes-devkit) leave out points nearer than 1 m too.
@@ -63,7 +64,7 @@ class NuscenesBin(BareRowFormat):
         return scan_of(
             points_xyz_m,
             intensity / 255,
-            _LASERS - 1 - laser.long(),
+            _LASERS - 1 - laser.long() if bool(laser.any()) else None,
             str(path),
             bad_points,
             filled=None if marks is None else marks[far],

@@ -133,7 +133,6 @@ def _open(path: Path) -> tuple[Any, Any, float, np.ndarray]:
 
 
 def _state_of(path: Path) -> tuple[int, int]:
-    """Return the size and the time of a file."""
     with open_file(path, _FORMAT) as file:
         stat = os.fstat(file.fileno())
     return stat.st_size, stat.st_mtime_ns

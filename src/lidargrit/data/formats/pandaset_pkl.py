@@ -98,9 +98,6 @@ def sensor_poses(folder: Path) -> Trajectory:
 
     Args:
         folder: folder ``lidar`` of a drive.
-
-    Raises:
-        DataError: its poses or times are missing or damaged.
     """
     cars = _trajectory(folder)
     pose_from_sensor = np.linalg.inv(_SENSOR_FROM_POSE)

@@ -46,11 +46,7 @@ def store_context(is_far: bool) -> "Context":
 
 
 def store_of(location: str) -> dict[str, Any]:
-    """Return the library's description of a folder on this machine, or behind a URL, with a slash at its end.
-
-    Raises:
-        DataError: the library cannot open such a URL.
-    """
+    """Return the library's description of a folder on this machine, or behind a URL, with a slash at its end."""
     if "://" not in location:
         return {"driver": "file", "path": f"{location}/"}
     import tensorstore  # noqa: PLC0415  quick start of commands that read no prepared scans

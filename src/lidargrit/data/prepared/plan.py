@@ -15,10 +15,8 @@ class PreparedSpec:
 
     Args:
         format: number of the format, raised whenever projection or simulation gives other pixels for the same scan.
-        source: source of the scans, as the user typed it.
         sensor: JSON of the sensor, with all its fine columns.
         variant: projection variant: ``exact``, ``reference`` or ``clamped``.
-        bad_points: treatment of bad points, ``refuse`` or ``drop``.
         bad_scans: treatment of bad scans, ``refuse`` or ``skip``.
         max_scans: largest number of scans taken from the source, evenly spaced; 0 for all.
         range_step_m: step in which ranges are kept, in metres.

@@ -133,7 +133,6 @@ class ShardWriter:
     """Images of one shard, collected in memory and now and then written; it goes on from what is there already.
 
     Args:
-        folder: prepared folder.
         spec: plan of the folder.
         shard: number of the shard.
     """
@@ -163,11 +162,7 @@ class ShardWriter:
         self._made.left_out[scan] = why
 
     def keep(self) -> None:
-        """Write what was added: first the pixels, then the file by which they count.
-
-        Raises:
-            OutputError: the disk is full or the folder cannot be written to.
-        """
+        """Write what was added: first the pixels, then the file by which they count."""
         try:
             if self._waiting:
                 self._write_waiting()

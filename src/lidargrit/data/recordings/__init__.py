@@ -31,9 +31,6 @@ def write_recording(path: Path, kind: str, scans: Iterable[Scan]) -> None:
     Args:
         kind: one of :data:`KINDS`.
         scans: scans with their times and poses; one without a time follows 0.1 s after the one before it.
-
-    Raises:
-        OutputError: the library that writes such files is missing.
     """
     write = import_module(f"{__name__}.{kind}").write
     try:

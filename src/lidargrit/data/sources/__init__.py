@@ -18,10 +18,10 @@ from lidargrit.data.run_folder import is_run, is_unfinished, locate, read_config
 from lidargrit.data.sources.image_files import ImageFileSource, image_files
 from lidargrit.data.sources.memory import CutSource
 from lidargrit.data.sources.sample_formats import (
-    is_tensor_folder,
     load_sample_format,
     read_tensor_folder,
     recognise,
+    samples_in,
     sensor_of_tensors,
 )
 from lidargrit.data.sources.samples import is_sample_folder, read_facts, read_samples
@@ -32,11 +32,7 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 
 
 class DatasetSource(Source):
-    """Scans of a data set: files in a known layout, or simulated scans.
-
-    Args:
-        bad_points: treatment of NaN, infinite and origin points.
-    """
+    """Scans of a data set: files in a known layout, or simulated scans."""
 
     kind, has_points = "scans", True
 
@@ -233,8 +229,8 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
         return SampleSource(text, folder)
     if here and is_unfinished(folder):
         read_config(folder)  # which says so
-    if here and is_tensor_folder(folder):
-        return TensorSource(text, folder)
+    if (of_others := samples_in(folder)) is not None:
+        return TensorSource(text, of_others)
     if "://" in text or (here and is_prepared(text)):
         return PreparedSource(text)
     images = image_files(folder) if text and (here or folder.is_file()) else []

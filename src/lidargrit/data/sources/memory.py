@@ -41,14 +41,13 @@ class MemorySource(Source):
         """Project the scans, or so many of them, evenly spaced."""
         config = config or DataConfig()
         self.projection_variant = config.projection_variant
-        return _imaged(self._scans.__getitem__, len(self._scans), sensor or self.sensor, config)
+        return _imaged(self._scans.__getitem__, len(self._scans), sensor or self.sensor, config, Provenance())
 
 
 class CutSource(Source):
     """The scans of a data set, each without what lies behind the first points of its file.
 
     Args:
-        source: source of the scans.
         num_points: largest number of points of a scan.
     """
 
@@ -73,11 +72,14 @@ class CutSource(Source):
         """Project the first points of the scans, or of so many of them, evenly spaced."""
         scans, config = self.scans(), config or DataConfig()
         self.projection_variant = config.projection_variant
+        chosen = evenly_spaced(config.max_scans or len(scans), len(scans))
+        names, drives = (tuple(of(index) for index in chosen) for of in (scans.name, scans.recording))
         return _imaged(
             lambda index: _first_points(scans.scan(index), self._num_points),
             len(scans),
             sensor or config.imaged(self.sensor),
             config,
+            Provenance(names, drives),
         )
 
 
@@ -89,24 +91,25 @@ def _first_points(scan: Scan, num_points: int) -> Scan:
     return scan.select(torch.arange(min(num_points, len(scan))))
 
 
-def _imaged(scan: Callable[[int], Scan], count: int, sensor: SensorModel, config: DataConfig) -> RangeImages:
+def _imaged(
+    scan: Callable[[int], Scan],
+    count: int,
+    sensor: SensorModel,
+    config: DataConfig,
+    provenance: Provenance,
+) -> RangeImages:
     chosen = evenly_spaced(config.max_scans or count, count)
     images = [project_by_what_fits(scan(index), sensor, config.projection_variant)[0] for index in chosen]
-    return RangeImages(sensor, [_Images(images)])
+    return RangeImages(sensor, [_Images(images, provenance)])
 
 
 class _Images:
-    """Range images in memory as a store."""
-
-    provenance = Provenance()
-
-    def __init__(self, images: Sequence[RangeImage]) -> None:
-        self._images = images
+    def __init__(self, images: Sequence[RangeImage], provenance: Provenance) -> None:
+        self._images, self.provenance = images, provenance
 
     def __len__(self) -> int:
         return len(self._images)
 
     def read(self, index: int) -> Pixels:
-        """Return the pixels of one image."""
         image = self._images[index]
         return Pixels(image.range_m.numpy(), {name: pixels.numpy() for name, pixels in image.planes.items()})

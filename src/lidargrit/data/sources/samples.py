@@ -89,9 +89,6 @@ def read_condition(folder: Path, seeds: Sequence[int], kind: type[ConditionT]) -
     Args:
         seeds: seeds of the scans, which have all been sampled.
         kind: type of the condition, which ``samples.json`` names.
-
-    Raises:
-        ScanError: no sample of a seed, or one that was sampled under no such condition.
     """
     known: dict[str, list[Tensor]] = {}
     wanted = f"a sample under a condition {kind.__name__}"

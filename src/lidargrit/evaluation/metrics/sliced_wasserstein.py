@@ -104,7 +104,6 @@ class SlicedWasserstein(ImageMetric):
         return value, {**details, "num_compared": n}
 
     def _level_sizes(self) -> list[int]:
-        """Return the number of patch positions in an image of each level."""
         assert self.kind is not None
         rows, columns = self.kind.height, self.kind.width
         return [num_positions(rows >> level, columns >> level) for level in range(num_levels(rows, columns))]

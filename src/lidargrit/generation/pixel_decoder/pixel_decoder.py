@@ -19,7 +19,6 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     Phase,
     at_phases,
     join_phases,
-    of_host,
     one_of_phases,
 )
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
@@ -27,6 +26,7 @@ from lidargrit.generation.pixel_decoder.ray_encoding import with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
+from lidargrit.nn.random import of_host
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.planes import planes_of
 from lidargrit.scans.sensors import SensorModel
@@ -226,7 +226,6 @@ class PixelDecoder(nn.Module):
     def _nll(
         self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage, steps: RangeSteps | None = None
     ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
-        """Return the negative log-likelihood of mask and range at phases of one lattice."""
         mask, v = images.return_mask, images.range_m.log1p()
         returned = at_phases(mask, phases)
         of_mask = self.mask.phase_nll(phases, guided[0], guide, mask)
@@ -250,7 +249,6 @@ class PixelDecoder(nn.Module):
 
         Args:
             decoded: output of the tokenizer's decoder for as many scans; None without a tokenizer.
-            sampling: settings of the sampling of masks and ranges.
             condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
                 are when their phase comes: later phases know of them, earlier ones do not.
         """

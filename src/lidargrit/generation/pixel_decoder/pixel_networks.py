@@ -22,13 +22,12 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     at_phases,
     cells_of,
     generated_before,
-    of_host,
     one_of_phases,
     phases_of,
 )
 from lidargrit.generation.pixel_decoder.ray_encoding import RowEncoding, coarsest_cell_of
 from lidargrit.nn.precision import at_least_32_bits
-from lidargrit.nn.random import rngs_of
+from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
@@ -330,7 +329,6 @@ class MaskNetwork(PhaseNetwork):
         Args:
             guide: output of the decoder for every pixel.
             uniform: random numbers in [0, 1): independent ones, or those that ``noise`` makes of them.
-            condition: observed part of the scans, whose returns are kept as they are.
         """
         guided = self.guided(guide)
         mask = condition.return_mask & condition.return_observed

@@ -141,14 +141,9 @@ def one_of_phases(phases: list[Phase], rng: torch.Generator) -> list[Phase]:
     """Return a random phase of one lattice, which stands for all of them in training.
 
     Args:
-        rng: random numbers of the host (:func:`of_host`).
+        rng: random numbers of the host (:func:`~lidargrit.nn.random.of_host`).
     """
     return [phases[int(torch.randint(len(phases), (), generator=rng, device="cpu"))]]
-
-
-def of_host(rng: torch.Generator) -> torch.Generator:
-    """Return a source of random numbers whose values the host knows without waiting for a device."""
-    return rng if rng.device.type == "cpu" else torch.Generator().manual_seed(rng.initial_seed())
 
 
 def generated_before(phases: Sequence[Phase]) -> Float[Tensor, "P 1 4 1 1"]:

@@ -155,7 +155,6 @@ class RangeMixture:
         return torch.cat([compute(_Pairs(*block)) for block in blocks]).view_as(self.centres)
 
     def _bounds(self) -> tuple[Float[Tensor, "*P K"], Float[Tensor, "*P K"]]:
-        """Return each component's distribution function at the two limits."""
         low, high = _log1p(self.limits_m)
         inverse = (-self.log_scales).exp()
         return ((low - self.centres) * inverse).sigmoid(), ((high - self.centres) * inverse).sigmoid()
@@ -189,7 +188,6 @@ class _Pairs:
         self._distance = (centres - others).abs_().mul_(-self._steepness)
 
     def log_density(self) -> Float[Tensor, "P K"]:
-        """Return the natural logarithm of the density of v at every component's centre."""
         s = self._distance.sigmoid()
         return _finite_log(s.addcmul_(s, s, value=-1).mul_(self._heights).sum(0))  # the logistic density: s (1 - s)
 

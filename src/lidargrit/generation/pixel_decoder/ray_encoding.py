@@ -26,11 +26,7 @@ _NEAREST_M, _FARTHEST_M, _HEIGHT_M = (0.0, 3.0), (20.0, 250.0), (1.0, 3.0)
 
 
 def check_bounds(sensor: SensorModel) -> None:
-    """Refuse a sensor beyond those that networks for any sensor are trained on (:mod:`lidargrit.scans.drawn_sensors`).
-
-    Raises:
-        ConfigError: tells what lies beyond which bounds.
-    """
+    """Refuse a sensor beyond those of :mod:`lidargrit.scans.drawn_sensors`, on which networks for any are trained."""
     elevation_deg = sensor.elevation_rad.mean(1) * (180 / math.pi)
     apart_deg = -elevation_deg.diff() if sensor.height > 1 else elevation_deg.new_full((1,), _APART_DEG[0])
     height_m = sensor.setup.height_m if sensor.setup else _TYPICAL_HEIGHT_M

@@ -75,9 +75,8 @@ class VqvaeConfig(TokenizerConfig):
         error_unit: ``encoded`` for the error between encodings, as in the paper; ``metres`` for the error between
             ranges, scaled so that with the linear encoding the two are equal. With the logarithmic encoding the first
             weighs near surfaces more, the second far ones.
-        reflectance: whether reflectance is encoded and decoded beside the range; not so in the paper.
-        reflectance_weight: weight of the mean absolute error of the reflectance of returns, mapped to [-1, 1] as the
-            encoded range is. 1 as in R2DM and LiDARGen, whose losses weigh the channels of range and reflectance alike.
+        reflectance: whether reflectance is encoded and decoded beside the range; not so in the paper. Both are mapped
+            to [-1, 1], and their errors weigh alike, as in R2DM and LiDARGen.
         codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
         restart_dead_codes: whether codes that are hardly ever used restart from latents, so that the codebook does not
             collapse; the reference has no such remedy.
@@ -97,7 +96,6 @@ class VqvaeConfig(TokenizerConfig):
     reconstruction: Literal["paper", "reference", "returns"] = "paper"
     error_unit: Literal["encoded", "metres"] = "encoded"
     reflectance: bool = False
-    reflectance_weight: Weight = 1.0
     codebook_loss: CodebookLoss = "paper"
     restart_dead_codes: bool = True
 
@@ -269,7 +267,7 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
             error = reconstruction_loss(
                 2 * reflectance - 1, 2 * required_reflectance(images.reflectance, _SETTING) - 1, mask, mask, "returns"
             )
-            loss = loss + self.config.reflectance_weight * error
+            loss = loss + error
             terms["reflectance_mae"] = error.detach() / 2
         with torch.no_grad():
             error_m = (range_m - images.range_m).abs()

@@ -159,7 +159,6 @@ class _Completion:
         return self.model.sensor if self.output.format == IMAGE else self.task.sensor_of_points(job.scan)
 
     def jobs(self, files: Sequence[int]) -> Iterator[_Job]:
-        """Read each scan of some of the files once."""
         count = self.output.count
         for index, of_scan in groupby(files, lambda file: file // count):
             job = None
@@ -206,7 +205,6 @@ def complete_scans(
     ``completed.json`` says how they were made, and ``sensor.json`` on which rays points lie.
 
     Args:
-        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: an empty folder, or one that the same command began.
         model: model or classical method; see :func:`lidargrit.inference.complete.open_model`.
         task: the work on each scan.

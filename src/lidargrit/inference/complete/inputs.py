@@ -214,7 +214,6 @@ def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:
     """Open the scans that a user named.
 
     Args:
-        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         reader: projection of points to range images.
         config: number of scans, and what to do with unusable points.
     """

@@ -91,7 +91,6 @@ class Pattern:
         return _read_mask(Path(self.text), (height, width))
 
     def _numbers(self) -> list[float]:
-        """Return the numbers behind the colon."""
         name, _, rest = self.text.partition(":")
         wanted, count = {
             "rows": ("rows:N with a whole N from 2 to 64", 1),

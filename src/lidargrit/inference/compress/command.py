@@ -59,7 +59,6 @@ def compress_scans(
     """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
 
     Args:
-        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
         model: run with a pixel decoder; scans are projected with its sensor, in the way of its training.
         config: number of scans, and what to do with unusable points and scans.
@@ -103,8 +102,6 @@ class _Work:
 
 @dataclass(eq=False)
 class _Compressor:
-    """A model and the scans that it compresses."""
-
     codec: ScanCodec
     inputs: Inputs
     skips: bool
@@ -112,14 +109,12 @@ class _Compressor:
 
     @classmethod
     def of(cls, work: _Work) -> "_Compressor":
-        """Open the model and the scans."""
         sensor = SensorModel.from_json(json.loads(work.rays)) if work.rays else None
         codec, config = _codec(work.model, work.step_mm, sensor), work.config
         reader = ScanReader(codec.sensor, projection_variant(locate(work.model)), projection=config.projection)
         return cls(codec, open_inputs(work.source, reader, config), config.bad_scans == "skip")
 
     def write(self, folder: Path, indices: Sequence[int]) -> int:
-        """Compress some scans into a folder, and return their number."""
         for index in indices:
             data, returns = b"", 0
             try:

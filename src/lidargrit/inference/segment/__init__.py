@@ -21,7 +21,6 @@ def open_segmenter(word: str, device: str = "") -> Segmenter:
 
     Args:
         word: folder of a run or of a bundle, or ``pretrained``.
-        device: device to compute on; a GPU if there is one and none is named.
     """
     folder, wanted = locate(word, "segment"), "a segmenter's run, or pretrained"
     if not folder.exists():

@@ -144,7 +144,6 @@ def segment_scans(
     point on the ray of each return. Files that are there already are not written again.
 
     Args:
-        source: a file, a folder or another source of scans, samples, prepared scans, or range images as ``.npy``.
         out: an empty folder, or one that the same command began.
         model: segmenter; see :func:`.open_segmenter`.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
@@ -211,7 +210,6 @@ class _Labels:
         )
 
     def of(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
-        """Return the labels of a scan of the source."""
         if isinstance(self._scans, ImageScans):
             image = label_images(self._segmenter, RangeImage.stack([self._scans.image(index)]))
             assert image.label is not None

@@ -64,7 +64,6 @@ def as_json(fit: SensorFit) -> dict[str, Any]:
 
 
 def _unit(setup: SensorSetup | None) -> str:
-    """Describe what planes tell of this unit."""
     if setup is None:
         return "too few planes to tell its noise"
     noise_cm, growth_mm, offsets_cm = (

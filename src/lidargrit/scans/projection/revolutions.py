@@ -69,6 +69,5 @@ def _told_returns(scan: Scan) -> str:
 
 
 def _directions_rad(scan: Scan) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Return azimuth and elevation of every point."""
     x, y, z = scan.points_xyz_m.double().numpy().T
     return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))

@@ -38,9 +38,6 @@ class SensorSetup(Settings):
         glass_passes: share of the light that goes through a pane, which depends on the wavelength.
         reflectance_scale: factor on all reflectances: makers scale them as they like.
         height_m: height above the road, in metres.
-
-    Raises:
-        ConfigError: a number out of its bounds.
     """
 
     range_sigma_m: Annotated[float, Bounds(0, 0.5)] = 0.01

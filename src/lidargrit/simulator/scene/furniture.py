@@ -72,7 +72,6 @@ def _guide(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 
 
 def _signal(builder: ShapeBuilder, rng: np.random.Generator) -> None:
-    """A traffic light."""
     tall = rng.uniform(3.0, 3.6)
     _mast(builder, tall, 0.06, 1.0)
     builder.add(_BODY, boxes(np.array([-0.28, -0.15, tall - 1.0]), np.array([-0.06, 0.15, tall - 0.05])))
@@ -139,7 +138,6 @@ def _shelter(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 
 
 def _bollard(builder: ShapeBuilder, rng: np.random.Generator) -> None:
-    """A low post."""
     tall, wide = rng.uniform(0.8, 1.1), rng.uniform(0.05, 0.09)
     builder.add(_POLE, lathe(wide * np.array([1.3, 1.3, 1.0, 1.0, 0.7, 0.0]),
                              tall * np.array([-0.2, 0.12, 0.14, 0.9, 0.98, 1.0]), 12))  # fmt: skip

@@ -77,7 +77,6 @@ def _v_edges(plan: StreetPlan) -> np.ndarray:
 
 
 def _kinds(plan: StreetPlan, rng: np.random.Generator, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return what each cell of the grid is."""
     bays = rng.random(2) < 0.35  # some parked rows stand on a strip of their own
     green = {"city": 0.25, "suburb": 0.6, "country": 1.0}[plan.theme]
     block = (np.floor(u / 17.0) * 7 + np.floor(v / 23.0)).astype(int) % 64

@@ -56,12 +56,13 @@ class Hints(NamedTuple):
         return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels, bright)
 
 
-def hints_of(condition: Observed) -> Hints:
-    """Return the hints of a batch of scans, on the device of the condition."""
+def hints_of(condition: Observed, device: torch.device | None = None) -> Hints:
+    """Return the hints of a batch of scans, on a device; on that of the condition if none is given."""
+    device, dtype = condition.range_m.device if device is None else device, condition.range_m.dtype
     every = [SeenScan.of(condition, index) for index in range(len(condition))]
     next_returns = [[_next_return(seen, *side) for side in _SIDES] for seen in every]
     both = [_of_one(seen, nexts) for seen, nexts in zip(every, next_returns, strict=True)]
-    maps, candidates = (torch.from_numpy(np.stack(part)).to(condition.range_m) for part in zip(*both, strict=True))
+    maps, candidates = (torch.from_numpy(np.stack(part)).to(device, dtype) for part in zip(*both, strict=True))
     labels, reflectances = [], []
     for index, (seen, nexts) in enumerate(zip(every, next_returns, strict=True)):
         if condition.label is not None:
@@ -71,8 +72,7 @@ def hints_of(condition: Observed) -> Hints:
             interpolated = seen.triangles.weighed(pixels) if seen.returned.any() else np.zeros_like(pixels)
             reflectances.append(np.stack((interpolated, *_at_returns(pixels, seen, nexts))))
     of_labels, of_reflectance = (
-        torch.from_numpy(np.stack(found)).to(condition.range_m.device) if found else None
-        for found in (labels, reflectances)
+        torch.from_numpy(np.stack(found)).to(device) if found else None for found in (labels, reflectances)
     )
     return Hints(maps, candidates, of_labels, of_reflectance)
 

@@ -16,7 +16,7 @@ from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, reflectance_error, required_reflectance
 from lidargrit.generation.semantic_classes import class_indices, labels_to_learn
 from lidargrit.nn.flops import FlopCounter
-from lidargrit.nn.random import rngs_of
+from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
@@ -63,9 +63,10 @@ class CompletionObjective(Objective):
         share of hidden returns whose class it finds. Reflectance is told as often; beside the loss then stands its mean
         absolute error.
         """
-        images = example.images
+        images, rng = example.images, of_host(rng)
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
-        condition, learned = Observed.of_pixels(images, observed), self.completion.config
+        # Hints are searched for on the host, so all that they need is brought there once.
+        condition, learned = Observed.of_pixels(images.to("cpu"), observed), self.completion.config
         planes = dict[str, Tensor]()  # no hints are computed of what the network does not see
         if learned.labels:
             planes["label"] = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
@@ -73,7 +74,8 @@ class CompletionObjective(Objective):
             shown = required_reflectance(condition.reflectance, _SETTING)
             planes["reflectance"] = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
         condition = replace(condition, planes=planes)
-        point = self.completion(hints_of(condition), observed)
+        observed = observed.to(images.range_m.device)
+        point = self.completion(hints_of(condition, images.range_m.device), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
         count, num_returns = hidden.sum((1, 2)).clamp(min=1), returns.sum((1, 2)).clamp(min=1)
@@ -109,15 +111,19 @@ def _class_terms(
 
 
 def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -> Bool[Tensor, "B H W"]:
-    """Return masks of observed pixels for training: some rows, all but a sector or a box of it, or single pixels."""
+    """Return masks of observed pixels for training: some rows, all but a sector or a box of it, or single pixels.
+
+    Args:
+        rng: random numbers of the host (:func:`~lidargrit.nn.random.of_host`).
+    """
 
     def uniform() -> float:
-        return float(torch.rand((), generator=rng, device=rng.device))
+        return float(torch.rand((), generator=rng))
 
     masks = []
     for _ in range(count):
         kind, first, second, third = uniform(), uniform(), uniform(), uniform()
-        mask = torch.zeros(height, width, dtype=torch.bool, device=rng.device)
+        mask = torch.zeros(height, width, dtype=torch.bool)
         if kind < _KINDS[0]:
             step = _ROW_STEPS[int(first * len(_ROW_STEPS))]
             mask[int(second * step) :: step] = True
@@ -130,7 +136,7 @@ def random_patterns(count: int, height: int, width: int, rng: torch.Generator) -
             mask = mask.roll(int(second * width), 1)
         else:
             share = _SHARES[0] * (_SHARES[1] / _SHARES[0]) ** first
-            mask = torch.rand(height, width, generator=rng, device=rng.device) < share
+            mask = torch.rand(height, width, generator=rng) < share
         masks.append(mask)
     return torch.stack(masks)
 

@@ -130,7 +130,6 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         ones.
 
         Args:
-            condition: observed part of the scans; None for new ones.
             count: number of scans to return.
         """
         self.check_choice(sampling.mask, sampling.pixels())

@@ -21,7 +21,7 @@ from lidargrit.generation.tokenizers import CodebookTokenizer, Tokenizer, Tokeni
 from lidargrit.generation.tokenizers.curve_vqvae import CurveVqvaeConfig
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.published import read_checkpoint, weights_below
-from lidargrit.nn.random import SeededNoise
+from lidargrit.nn.random import SeededNoise, rngs_of
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
@@ -198,7 +198,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         latents = latent_diffusion.ddim(self.denoiser, noise, self._shares(), sampling.steps, sampling.eta)
         latents = latents * self.latent_scale if self.axes is None else self.axes.latents(latents)
         decoding = self.tokenizer.for_decoding("fp32")
-        return decoding.sample(self.tokenizer.quantised(latents), noise.rngs, sampling.mask)
+        return decoding.sample(self.tokenizer.quantised(latents), rngs_of(seeds), sampling.mask)
 
     def cost(self, sampling: LidmSampling | None = None) -> Cost:
         """Return the denoiser's passes, one a step, and one of the decoder."""

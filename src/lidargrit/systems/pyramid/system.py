@@ -22,7 +22,7 @@ from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling, nats
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import inference
-from lidargrit.nn.random import rngs_of
+from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
@@ -113,8 +113,6 @@ class Pyramid(Generator[PyramidConfig, PixelSampling]):
         """Return scans whose finest levels are sampled given the true coarser ones, which tell what these keep.
 
         Args:
-            images: true scans.
-            seeds: seed of each scan.
             levels: number of levels that are sampled.
         """
         every, made = levels_of(self.levels), []
@@ -197,6 +195,7 @@ class PyramidObjective(Objective):
         return {"loss": loss, **terms}
 
     def _estimate(self, levels: list[Level], pyramid: list[RangeImage], rng: torch.Generator) -> Tensor:
+        rng = of_host(rng)  # once, so that levels choose apart
         chance = float(torch.rand((), generator=rng))
         shares = (_SHARES[: len(levels) - 1] + (1.0,) * len(levels))[: len(levels)]
         counts = [int(len(pyramid[0]) * share + chance) for share in shares]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from lidargrit.generation.presets import DIFFUSION_ON_KITTI_360, KITTI_360, MINUTES, STREETS, preset, variant
 from lidargrit.systems.r2flow.hdit import HditConfig
-from lidargrit.systems.r2flow.system import FlowSampling, R2flowConfig, ReflowConfig
+from lidargrit.systems.r2flow.system import R2flowConfig, ReflowConfig
 
 _SMALL = preset(
     "R2Flow (1-RF), small: 64x256, for two CPU cores",
@@ -31,9 +31,7 @@ TO_COMPARE_WITH = {
         _SMALL,
         {
             # The adaptive solver would take most of the training's time.
-            "model.reflow": ReflowConfig(
-                4_000, distilled_steps=1, distilled_pairs=4_000, solving=FlowSampling(steps=16)
-            ),
+            "model.reflow": ReflowConfig(4_000, distilled_steps=1, distilled_pairs=4_000, pair_steps=16),
             "training.reflow": _FURTHER,
             "training.distillation": _FURTHER,
         },

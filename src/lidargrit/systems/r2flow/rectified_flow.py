@@ -2,7 +2,7 @@
 
 import copy
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
@@ -72,13 +72,14 @@ class ReflowConfig(Settings):
         distilled_steps: number of steps that the third training distils the flow to; 1, 2 and 4 are published. 0 for no
             third training.
         distilled_pairs: number of pairs that the third training learns from.
-        solving: settings by which the flow so far is followed to make the pairs; the adaptive solver is published.
+        pair_steps: number of equal steps in which the flow so far is followed to make a pair; 0 for the adaptive
+            solver, as published.
     """
 
     pairs: Count = 1_000_000
     distilled_steps: Annotated[int, Bounds(0, _STEPS)] = 0
     distilled_pairs: Count = 100_000
-    solving: FlowSampling = field(default_factory=lambda: FlowSampling(solver="dopri5"))
+    pair_steps: Annotated[int, Bounds(0, STEPS_AT_MOST)] = 0
 
 
 def steps_of(sampling: FlowSampling, distilled_steps: int = 0) -> int:

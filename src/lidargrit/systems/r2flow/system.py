@@ -77,7 +77,7 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> R2flowConfig:
         """Return a transformer of two levels and 8 channels, and every training with 4 pairs."""
-        reflow = ReflowConfig(pairs=4, distilled_steps=2, distilled_pairs=4, solving=FlowSampling(steps=2))
+        reflow = ReflowConfig(pairs=4, distilled_steps=2, distilled_pairs=4, pair_steps=2)
         return R2flowConfig(HditConfig(8, 8, (1, 1), (1, 2)), reflow=reflow)
 
     @classmethod
@@ -102,7 +102,8 @@ class R2flow(Generator[R2flowConfig, FlowSampling]):
         if stage == "flow" or reflow is None:
             return FlowMatching(self.network, self.sensor)
         pairs, steps = (reflow.pairs, 0) if stage == "reflow" else (reflow.distilled_pairs, reflow.distilled_steps)
-        return PairMatching(self.network, self.sensor, pairs, reflow.solving, steps)
+        solving = FlowSampling(steps=reflow.pair_steps) if reflow.pair_steps else FlowSampling(solver="dopri5")
+        return PairMatching(self.network, self.sensor, pairs, solving, steps)
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: FlowSampling) -> RangeImage:
         return decode(self._solved(seeds, sampling).images, self.sensor)

@@ -57,9 +57,6 @@ class SegmenterNetworkConfig(Settings):
 class SegmenterNetwork(nn.Module):
     """A small U-Net over the returns of a scan: range, height above the sensor, and elevation of every pixel.
 
-    Args:
-        sensor: the rays and limits of the range images.
-
     Source:
         the inputs of Milioto et al., RangeNet++, IROS 2019, without x and y, which tell where the scan turns.
     """
@@ -81,7 +78,6 @@ class SegmenterNetwork(nn.Module):
         """Return a logit for each of the benchmark's classes at every pixel.
 
         Args:
-            range_m: ranges in metres, 0 where nothing returned.
             reflectance: reflectance of the returns, NaN where it is not known; None if it is known of none.
         """
         more = dict[str, Tensor]()

@@ -58,11 +58,7 @@ class VoxelAutoencoderConfig(Settings):
 
 
 class VoxelAutoencoder(nn.Module):
-    """Encoder, codebook and decoder of voxels.
-
-    Args:
-        config: sizes of the networks, and the cells of the voxels.
-    """
+    """Encoder, codebook and decoder of voxels."""
 
     def __init__(self, config: VoxelAutoencoderConfig) -> None:
         super().__init__()

@@ -72,9 +72,6 @@ def whole_rows(data: bytes, path: Path, width: int, layout: str, cure: str = "")
         width: numbers of a point.
         layout: rows that were wanted, in words, for an error.
         cure: beginning of the sentence on what helps, before a new download; "" if nothing else does.
-
-    Raises:
-        ScanError: the last row is not whole.
     """
     if over := len(data) % (4 * width):
         raise ScanError(

@@ -211,7 +211,6 @@ def _head(file: BinaryIO, at: int) -> tuple[int, int]:
 
 
 def _records(unpacked: bytes) -> Iterator[tuple[int, bytes]]:
-    """Take the records of a chunk apart."""
     at = 0
     while at < len(unpacked):
         length = int.from_bytes(unpacked[at + 1 : at + _HEAD_BYTES], "little")

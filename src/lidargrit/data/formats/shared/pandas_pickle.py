@@ -43,7 +43,6 @@ class _Array(_Record):
         return np.frombuffer(data, f"<{code}").reshape(shape, order="F" if is_fortran else "C")
 
     def names(self) -> list[str]:
-        """Return its texts."""
         data = self.state[4]
         if not isinstance(data, list) or not all(isinstance(name, str) for name in data):
             raise ValueError("names of columns that are no text")

@@ -100,7 +100,6 @@ def text_columns(data: bytes, element: Element) -> dict[str, np.ndarray]:
 
 
 def _lengths(data: bytes, start: int, kinds: list[tuple[np.dtype, np.dtype | None]]) -> list[int]:
-    """Return the number of values of each property in the row at a position."""
     lengths = []
     for kind, count_kind in kinds:
         length = 1
@@ -123,7 +122,6 @@ def _value(data: bytes, at: int, kind: np.dtype) -> int:
 def _uneven_rows(
     data: bytes, start: int, element: Element, kinds: list[tuple[np.dtype, np.dtype | None]]
 ) -> tuple[dict[str, np.ndarray], int]:
-    """Go through rows whose lists differ in length."""
     places = element.single()
     wanted = {at: np.empty(element.rows, np.int64) for at in places.values()}
     for row in range(element.rows):

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.core import discovery
+from lidargrit.core.arrays import mapped_member
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import DataError, ScanError, UnknownNameError, nearest_names
 from lidargrit.data import formats
@@ -97,6 +98,8 @@ def load_sample_format(name: str) -> SampleFormat:
 def is_tensor_folder(folder: Path) -> bool:
     """Return whether a folder holds samples of another program, and no scans, beside which weights may lie."""
     try:
+        if _holds_images_of_r3dpa(folder):  # beside a pickle that ends in .pcd
+            return True
         samples = folder.is_dir() and (
             any(True for _ in folder.glob("[!.]*.pth")) or _holds_points_without_colour(folder)
         )
@@ -105,10 +108,24 @@ def is_tensor_folder(folder: Path) -> bool:
         return False
 
 
+def samples_in(path: Path) -> Path | None:
+    """Return the folder in which a path holds samples of another program, or None if it holds none.
+
+    R3DPA writes pictures, an archive and text into three folders, LiDM pictures and text into two.
+    """
+    if path.name == "img.npz" and _holds_images_of_r3dpa(path.parent):
+        return path.parent
+    if not path.is_dir():
+        return None
+    return next((each for each in (path, path / "numpy", path / "pcd") if is_tensor_folder(each)), None)
+
+
 def recognise(folder: Path) -> str:
-    """Name the program that wrote a folder of samples, by the number of channels of the first tensor."""
+    """Name the program that wrote a folder of samples, by its text or archive, or the channels of the first tensor."""
     if _holds_points_without_colour(folder):
         return "lidm"
+    if _holds_images_of_r3dpa(folder):
+        return "r3dpa"
     path = _paths(folder)[0]
     shape = tuple(read_tensor(path).shape)
     forms = {name: load_sample_format(name) for name in discovery.names("sample-formats")}
@@ -221,6 +238,15 @@ def _holds_points_without_colour(folder: Path) -> bool:
     """Return whether a folder holds text in which each line has x, y, z in millimetres and the three zeros of LiDM."""
     first = min(folder.glob("[!.]*.txt"), default=None)
     return first is not None and bool(_POINT_WITHOUT_COLOUR.match(formats.first_bytes(first, 100)))
+
+
+def _holds_images_of_r3dpa(folder: Path) -> bool:
+    """Return whether a folder holds the archive of R3DPA, with five channels of each scan."""
+    try:
+        shape = mapped_member(folder / "img.npz", "arr_0").shape
+    except ValueError:
+        return False
+    return len(shape) == 4 and shape[1] == 5
 
 
 def _order(path: Path) -> tuple[list[int], str]:

@@ -24,9 +24,6 @@ def read(path: Path) -> Tensor:
 
     Projected like a scan, half of the points would fall into a neighbouring pixel, for they lie on the edges, and a
     third of the pixels would be lost.
-
-    Raises:
-        ScanError: no such text, or points that do not lie on the edges of pixels.
     """
     data = read_bytes(path, _BYTES_AT_MOST, _WANTED)
     try:

@@ -29,9 +29,6 @@ class PretrainedNetwork:
     """A network with published weights that is only evaluated: images in, features out.
 
     Pickled, it is the name of its file; whoever unpickles it reads that file.
-
-    Args:
-        name: name of the network, one of ``NETWORKS``.
     """
 
     def __init__(self, name: str, path: Path, device: str) -> None:
