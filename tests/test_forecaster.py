@@ -9,14 +9,18 @@ import torch
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.generator import load_class
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.scans.example import Example
 from lidargrit.scans.fine_columns import in_fine_columns
 from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
 from lidargrit.scans.warp import warp
+from lidargrit.systems.forecaster.network import COMPONENTS
+from lidargrit.systems.forecaster.own_past import with_own
 from lidargrit.systems.forecaster.system import Forecaster
 from lidargrit.systems.forecaster.worn_past import jittered, worn
+from test_lidargan import images_of
 
 STRIDE = 4
 ELEVATION_RAD = torch.linspace(0.03, -0.3, 32)[:, None]
@@ -140,6 +144,73 @@ def test_a_worn_past_lacks_scans_keeps_rotations_and_is_jittered_alike():
     torch.testing.assert_close((changed.nearest.range_m - warped.nearest.range_m)[seen], error_m[seen])
     assert torch.equal(changed.surface.range_m > 0, warped.surface.range_m > 0)
     assert 0.005 < float(error_m[seen].std()) < 0.15
+
+
+def test_a_past_may_end_with_own_samples_each_given_those_before():
+    _, past = standing(8, scans=4)
+    past.range_m[0, 0] = 0  # a scan that lacks
+    past.ages_s[0, 0] = 0
+    seen = list[tuple[int, list[float]]]()
+
+    def sample(given: Past, seeds: list[int]) -> RangeImage:
+        there = (given.range_m > 0).flatten(2).any(2)[0]
+        seen.append((int(there.sum()), given.ages_s[0].tolist()))
+        latest_m = given.range_m[:, -1, :, ::STRIDE] + 1.0
+        return RangeImage.masked(latest_m, latest_m > 1, SENSOR)
+
+    made = with_own(past, 1.0, sample, torch.Generator().manual_seed(0))
+    own = (made.range_m != past.range_m).flatten(2).any(2)
+    assert not bool(own[:, 0].any())
+    assert not bool(own[0, 1])  # the first that is there
+    assert bool(own[1:, -1].all())
+    assert bool((own[:, 1:] >= own[:, :-1]).all())  # at the end
+    for scan in range(1, 4):  # each is a metre farther than the one that it was given last
+        before_m, now_m = made.range_m[1:, scan - 1, :, ::STRIDE], made.range_m[1:, scan, :, ::STRIDE]
+        torch.testing.assert_close(now_m[own[1:, scan]], (before_m + 1)[own[1:, scan]] * (before_m > 0)[own[1:, scan]])
+    for count, ages_s in seen:  # as of a scan of the drive
+        assert ages_s[4 - count :] == pytest.approx([0.1 * step for step in range(count, 0, -1)])
+    assert torch.equal(with_own(past, 0.0, sample, torch.Generator()).range_m, past.range_m)
+
+
+def test_it_knows_rays_that_never_return_and_goes_on_from_a_decoder_behind_a_tokenizer():
+    images, past = standing(2)
+    images.range_m[:, 30, 5] = images.return_mask[:, 30, 5] = 0
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        own = Forecaster(forecaster().config, SENSOR).eval()
+        theirs = load_class("lidargrit")
+        sizes = replace(forecaster().config.pixels, decoded_components=False, mask_features=3)
+        donor = theirs(replace(theirs.smallest_config(SENSOR), pixels=sizes), SENSOR)
+        assert donor.pixels is not None
+        for weight in donor.pixels.parameters():
+            torch.nn.init.normal_(weight, std=0.2)
+    own.fit_statistics(images_of(images))
+    assert own.past.usual[30, 5] < -2.5 < 2.5 < own.past.usual[images.return_mask.all(0)].min()
+    logits = own.told(past, 2).return_logits
+    assert bool((logits[:, 30, 5] < -2.5).all())
+    taken = own.objective("pixels").weights_from(donor.objective("pixels"))
+    missing = own.objective("pixels").load_state_dict(taken, strict=False)
+    assert not missing.unexpected_keys
+    name = next(name for name in taken if name.startswith("pixels.range.") and name.endswith(".out.0.bias"))
+    logits, moved, scales = taken[name].chunk(3)
+    for ours, given in zip((logits, moved, scales), donor.objective("pixels").state_dict()[name].chunk(3), strict=True):
+        assert torch.equal(ours[:-COMPONENTS], given)
+        assert not bool(ours[-COMPONENTS:].any())
+    again = own.objective("pixels").weights_from(own.objective("pixels"))
+    assert again.keys() | {"past.usual"} == own.objective("pixels").state_dict().keys()
+
+
+def test_a_point_forecast_leaves_nothing_to_chance_and_is_nearer_than_a_sample():
+    images, past = standing(1)
+    point = PixelSampling(point=True)
+    one, other = (forecaster().sample([seed], past, point) for seed in (1, 2))
+    assert torch.equal(one.range_m, other.range_m)
+
+    def error_m(made: RangeImage) -> float:
+        both = made.return_mask & images.return_mask
+        return float((made.range_m - images.range_m)[both].abs().mean())
+
+    assert error_m(one) < error_m(forecaster().sample([1], past))
 
 
 def test_columns_between_kept_ones_are_filled_along_surfaces():

@@ -9,7 +9,7 @@ from lidargrit.core.errors import counted_scans
 from lidargrit.core.untrusted import seed_number, whole_number
 
 EXAMPLES = """\
-  lidargrit forecast kitti_odometry:/data/kitti_odometry:00 next --model runs/forecaster       ten scans after its last
+  lidargrit forecast kitti_odometry:/data/kitti_odometry:00 next       ten scans after its last
   lidargrit forecast drives:00 next --model runs/forecaster --after 5 -n 20 --constant-speed
 """
 
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("drive", help="source of the scans of a drive with times and poses")
     add("out", type=Path, help="folder for the scans; the same command continues there")
-    add("--model", type=Path, required=True, help="a finished run that takes a past, such as of forecaster_compact")
+    add("--model", type=Path, default=Path("pretrained"), help="a finished run that takes a past (default: pretrained)")
     add("-n", "--count", type=whole_number, default=10, metavar="N", help="number of scans")
     add("--after", type=whole_number, metavar="SCAN", help="number of the last scan that is seen, from 0")
     add("--constant-speed", action="store_true", help="repetition of the last step, though later poses are known")
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.inference.drives import continued, write_drives
     from lidargrit.nn.devices import usable_device
 
-    run_folder = locate(options.model)
+    run_folder = locate(options.model, "drive")
     generator = load(run_folder).to(usable_device(options.device))
     way = continued(options.drive, generator.sensor, options.count, options.after, options.constant_speed)
     sampling = generator.parse_sampling(sampling_words(options.set))

@@ -12,7 +12,7 @@ from lidargrit.core.untrusted import seed_number, seeds_in_a_row, whole_number
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
   lidargrit sample runs/any mine --sensor mine.json       by a run of the preset multiscale_any
-  lidargrit sample runs/forecaster drives -n 2 --frames 100 --path poses.txt           two drives of ten seconds
+  lidargrit sample pretrained drives -n 2 --frames 100 --path poses.txt           two drives of ten seconds
 """
 
 
@@ -37,24 +37,24 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.processes import rank_and_world_size
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
-    from lidargrit.inference.drives import path_of, write_drives
+    from lidargrit.inference.drives import opening_of, path_of, write_drives
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
     from lidargrit.nn.devices import usable_device
 
-    seeds = seeds_in_a_row(options.seed, options.count)
+    seeds, job = seeds_in_a_row(options.seed, options.count), "drive" if options.frames else "sample"
     address, words, sensor = ray_address(options), sampling_words(options.set), sensor_of(options)
     if address:
         write_samples_on_ray(locate(options.run_folder), options.out, seeds, words, address, options.device)
     else:
         rank, world_size = rank_and_world_size(options.rank, options.world_size)
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-        device, run_folder = usable_device(options.device or own), locate(options.run_folder)
+        device, run_folder = usable_device(options.device or own), locate(options.run_folder, job)
         generator, seeds = load(run_folder).to(device), seeds[rank::world_size]
         generator = generator.for_sensor(sensor or generator.sensor)
         sampling = generator.parse_sampling(words)
         if options.frames:
-            ways = [path_of(options.frames, options.path)] * len(seeds)
-            write_drives(generator, run_folder, options.out, ways, seeds, sampling, path=str(options.path))
+            ways, first = [path_of(options.frames, options.path)] * len(seeds), opening_of(options.run_folder)
+            write_drives(generator, run_folder, options.out, ways, seeds, sampling, first, path=str(options.path))
         else:
             write_samples(generator, run_folder, options.out, seeds, sampling)
     print(f"done: {counted_scans(len(seeds) * max(1, options.frames))} in {options.out}; {look_at(options.out)}")

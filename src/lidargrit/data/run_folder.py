@@ -24,8 +24,8 @@ PRETRAINED = Path(__file__).parents[1] / "pretrained"
 PACKAGED = (PRETRAINED, PRETRAINED.with_name("pretrained_wide"))  # their names go wherever a run is wanted
 
 
-Job = Literal["sample", "complete", "raydrop", "segment"]
-"""What a run of a bundle does: sample new scans, complete scans, drop returns of clean ones, or label scans."""
+Job = Literal["sample", "complete", "raydrop", "segment", "drive"]
+"""What a run of a bundle does: sample new scans, complete scans, drop returns, label scans, or go on with drives."""
 
 
 def named_folder(name: str | Path) -> Path:

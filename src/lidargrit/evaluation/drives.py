@@ -16,6 +16,7 @@ from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.pasts import Pasts
+from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import open_source
 from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.drive_errors import (
@@ -29,6 +30,7 @@ from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.protocols import load_protocol, public_name
 from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
@@ -145,7 +147,7 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
 
 
 def _forecaster(model: str, device: str) -> Generator:
-    generator = load(model)
+    generator = load(locate(model, "drive"))
     if Past not in generator.takes:
         got = f"the model {model}, which takes no past"
         raise ConfigError(got, "one that forecasts", "leave --model out, or train one with data.condition=past")
@@ -175,6 +177,9 @@ def _errors_at(
             if generator is not None:
                 made = generator.sample([scan_seed(0, number)], past)
                 forecasts[model] = made.range_m[0].double().cpu()
+                if generator.Sampling is PixelSampling:
+                    made = generator.sample([scan_seed(0, number)], past, PixelSampling(point=True))
+                    forecasts[f"{model}, sampling.point=true"] = made.range_m[0].double().cpu()
             for name, range_m in forecasts.items():
                 found.setdefault(name, []).append(errors(range_m, true_m, drives.images.sensor))
     return found, standing

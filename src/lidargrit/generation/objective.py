@@ -32,6 +32,8 @@ class Objective(nn.Module, ABC):
     """Settings of the stage that, if true, add weights; training may start from a stage that lacks them."""
     settings: tuple[str, ...] = ()
     """Settings of the generator that it learns by, beside those that begin with the name of the stage."""
+    kin: tuple[type["Objective"], ...] = ()
+    """Other kinds from which :meth:`weights_from` takes what fits; training may start from a stage of theirs."""
     over: tuple[str, ...] = ()
     """Names of earlier stages whose networks compute what it learns from; it is of no use with other networks."""
     period: int = 1

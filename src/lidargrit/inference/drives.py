@@ -18,12 +18,13 @@ from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.drives import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.data.run_folder import locate
 from lidargrit.data.scan_folder import KittiTree, ScanFolder
 from lidargrit.data.sources import open_source
 from lidargrit.data.trajectories import read_trajectory
 from lidargrit.data.windows import TimedScan, drives_in
 from lidargrit.generation.conditions.past import PastTold
-from lidargrit.generation.generator import Generator, SamplingT
+from lidargrit.generation.generator import Generator, SamplingT, load
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.scans.condition import NOTHING, Condition
 from lidargrit.scans.fine_columns import in_fine_columns
@@ -127,6 +128,11 @@ def _fine(dataset: ScanDataset, index: int, sensor: SensorModel) -> Float[Tensor
     return project(dataset.scan(index), sensor.fine()).range_m
 
 
+def opening_of(name: str | Path) -> Generator[Any, Any] | None:
+    """Return the generator of first scans of drives: of a bundle with a run for drives the one that samples."""
+    return load(locate(name)) if locate(name) != locate(name, "drive") else None
+
+
 def write_drives(
     generator: Generator[Any, SamplingT],
     run_folder: Path,
@@ -134,6 +140,7 @@ def write_drives(
     ways: Sequence[Way],
     seeds: Sequence[int],
     sampling: SamplingT | None = None,
+    first: Generator[Any, Any] | None = None,
     **facts: str | int | bool | None,
 ) -> int:
     """Write a sequence of generated scans for each way, at bounded memory; scans that are there are kept.
@@ -143,6 +150,7 @@ def write_drives(
 
     Args:
         run_folder: folder that the generator was read from.
+        first: generator of a drive's first scan, where none is seen before it; the same one if not given.
         facts: entries of the manifest by which the ways are told from others.
 
     Returns:
@@ -152,6 +160,10 @@ def write_drives(
         got = f"a model of {generator.public_name()!r}, which takes no past"
         raise ConfigError(got, "a model of drives", "train one: lidargrit train forecaster_compact OUT")
     settings = generator.Sampling() if sampling is None else sampling
+    opening = generator if first is None else first
+    if not opening.sensor.same_rays(generator.sensor):
+        got = f"first scans of the sensor {opening.sensor.name!r}, {opening.sensor.height}x{opening.sensor.width}"
+        raise ConfigError(got, f"those of {generator.sensor.name!r}", "name a run of that sensor")
     names = [f"{drive:02d}/{frame:06d}" for drive, way in enumerate(ways) for frame in range(len(way.poses))]
     identities = [
         f"seed {seed}, frame {n}" for seed, way in zip(seeds, ways, strict=True) for n in range(len(way.poses))
@@ -162,17 +174,27 @@ def write_drives(
         for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
             moved = [transform_between(pose, way.poses[0]).numpy() for pose in way.poses]
             write_motions(out, f"{drive:02d}", moved, way.period_s)
-            _Drive(generator, way, seed, out / "sequences" / f"{drive:02d}", settings).write(progress)
+            _Drive(generator, opening, way, seed, out / "sequences" / f"{drive:02d}", settings).write(progress)
     return folder.num_written
 
 
 class _Drive:
-    """Writes the scans of one drive."""
+    """Writes the scans of one drive.
+
+    Args:
+        opening: generator of a scan before which there is none.
+    """
 
     def __init__(
-        self, generator: Generator[Any, SamplingT], way: Way, seed: int, folder: Path, sampling: SamplingT
+        self,
+        generator: Generator[Any, SamplingT],
+        opening: Generator[Any, Any],
+        way: Way,
+        seed: int,
+        folder: Path,
+        sampling: SamplingT,
     ) -> None:
-        self._generator, self._way, self._seed, self._sampling = generator, way, seed, sampling
+        self._opening, self._generator, self._way, self._seed, self._sampling = opening, generator, way, seed, sampling
         self._files = [folder / "velodyne" / f"{frame:06d}.bin" for frame in range(len(way.poses))]
 
     def write(self, progress: reporting.Progress) -> None:
@@ -184,8 +206,9 @@ class _Drive:
         for frame in range(begin, len(self._files)):
             time_s = way.begin_s + frame * way.period_s
             if missing[frame]:
-                past = self._past(seen, way.poses[frame], time_s)
-                images = self._generator.sample([scan_seed(self._seed, frame)], past, self._sampling)
+                seeds, past = [scan_seed(self._seed, frame)], self._past(seen, way.poses[frame], time_s)
+                opens = past is NOTHING and self._opening is not self._generator
+                images = self._opening.sample(seeds) if opens else self._generator.sample(seeds, past, self._sampling)
                 KittiBin.write(self._files[frame], _as_fired(images[0].to("cpu")))
                 progress.advance(1)
             seen.append(Seen(self._written(self._files[frame]), way.poses[frame], time_s))

@@ -55,7 +55,8 @@ def taken_stages(preset: Preset, generator: Generator) -> dict[str, Objective]:
         donor, config, ours = donors[run], preset.training[name], _Stage(name, generator)
         setting = f"training.{name}.start={config.start}"
         # Of a tokenizer :func:`_check` tells the kind.
-        alike = name in donor.stages and (name == "tokenizer" or type(donor.objective(name)) is type(ours.objective))
+        kinds = (type(ours.objective), *(() if config.frozen else ours.objective.kin))
+        alike = name in donor.stages and (name == "tokenizer" or type(donor.objective(name)) in kinds)
         if not alike:
             in_bundle = is_run(named_folder(run) / name)
             raise ConfigError(
@@ -125,6 +126,8 @@ def _check(setting: str, mine: _Stage, given: _Stage, trained: bool) -> None:
     """
     stage, ours, theirs = mine.name, mine.settings, given.settings
     differing = [name for name in ours if ours[name] != theirs.get(name) and not name.endswith("dropout")]
+    if type(given.objective) in mine.objective.kin:  # the shapes tell
+        differing = []
     same_sensor = mine.objective.sensor.same_rays(given.objective.sensor)
     given_shapes = given.shapes
     if trained:

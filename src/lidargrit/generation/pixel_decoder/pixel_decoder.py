@@ -40,6 +40,8 @@ _ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so m
 
 _NOISE_AT_MOST = 1e6  # beyond, the components' scales have no finite numbers; with 100 all ranges are noise already
 
+_EVEN = 0.4999  # in place of a random number: what is as likely as not returns
+
 _SENSORS_KEPT = 256  # whose rows are encoded, and whose surfaces are known
 
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
@@ -63,12 +65,14 @@ class PixelSampling(SamplingSettings):
         precision: number type of the networks' products. ``fp32`` is exact; ``bf16`` is quicker and moves some pixels;
             ``auto`` is ``bf16`` where the machine has instructions for it; ``tf32`` rounds what a GPU multiplies to 11
             digits.
+        point: whether nothing is left to chance: pixels return that probably do, at the median range.
     """
 
     range_temperature: Temperature = 0.0
     range_noise: Annotated[float, Bounds(above=0, most=_NOISE_AT_MOST)] = 0.7
     mask_correlation: Weight = 2.0
     precision: Precision = "fp32"
+    point: bool = False
 
 
 class PixelNll(NamedTuple):
@@ -257,7 +261,7 @@ class PixelDecoder(nn.Module):
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs])
         shares = self.mask.noise.shares(choices.mask_correlation)
         for numbers, rng in zip(uniform, rngs, strict=True):
-            numbers[0] = self.mask.noise(numbers[0], rng, shares)
+            numbers[0] = _EVEN if choices.point else self.mask.noise(numbers[0], rng, shares)
         device = guide.v.device
         uniform = uniform.to(device)
         condition = condition.to(device) if condition else Observed.nothing(self.sensor, len(rngs), device)
@@ -299,7 +303,10 @@ class PixelDecoder(nn.Module):
                 mixture = mixture.without_last()  # which is any range at all
             # Of every pixel, though some are observed and some do not return: the host need not know which.
             component, within = uniform[pixels][None].unbind(2)
-            sampled = mixture.sample(component, within, temperature, sampling.range_noise)[0]
+            if sampling.point:
+                sampled = mixture.median()[0]
+            else:
+                sampled = mixture.sample(component, within, temperature, sampling.range_noise)[0]
             found = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
             range_m[pixels] = found.where(mask[pixels], 0.0)
             v[pixels] = range_m[pixels].log1p()

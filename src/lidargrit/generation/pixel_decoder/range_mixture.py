@@ -82,6 +82,13 @@ class RangeMixture:
         densest = self._by_pairs(_Pairs.log_density).argmax(-1, keepdim=True)
         return self.centres.gather(-1, densest)[..., 0].expm1()
 
+    def median(self) -> Float[Tensor, "*P"]:
+        """Return in metres the centre of the component in whose order by range half of the probability is reached."""
+        order = self.centres.argsort(-1)
+        reached = self.logits.softmax(-1).gather(-1, order).cumsum(-1) >= 0.5 - 1e-6  # their sum may miss 1
+        half = order.gather(-1, reached.int().argmax(-1, keepdim=True))
+        return self.centres.gather(-1, half)[..., 0].expm1()
+
     def entropy(self, steps: RangeSteps) -> Float[Tensor, "*P"]:
         """Return the expected -ln of the probability of a step, by Gauss-Legendre quadrature over the quantiles of
         every component."""

@@ -11,7 +11,9 @@ PRESETS = {
     "forecaster_compact": preset(
         "the next scan of a drive: 64x256, for one CPU core and two hours",
         DataConfig(("kitti_odometry:drives:all",), ("kitti_odometry:drives_val:all",), condition="past"),
-        ForecasterConfig(replace(PIXEL_DECODER, mask_features=12, coarse_range_width=48, decoded_components=True)),
+        ForecasterConfig(
+            replace(PIXEL_DECODER, mask_features=12, coarse_range_width=48, decoded_components=True), own_past=0.25
+        ),
         pixels=replace(
             PIXELS,
             scans=12_000,
@@ -19,6 +21,7 @@ PRESETS = {
             optimiser="muon",
             schedule="linear_second_half",
             average_over_scans=600,
+            start="pretrained/lidargrit",
         ),
     ),
 }

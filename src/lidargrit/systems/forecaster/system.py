@@ -3,9 +3,12 @@
 from dataclasses import dataclass, field, replace
 
 import torch
+from torch import Tensor
 
 from lidargrit.core.configuration import Settings
-from lidargrit.core.typed_values import Count
+from lidargrit.core.determinism import evenly_spaced
+from lidargrit.core.typed_values import Count, Share
+from lidargrit.data.images import RangeImages
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -23,7 +26,12 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage
 from lidargrit.scans.warp import warp
 from lidargrit.systems.forecaster.network import COMPONENTS, PastNetwork
+from lidargrit.systems.forecaster.own_past import with_own
+from lidargrit.systems.forecaster.start import behind_past
 from lidargrit.systems.forecaster.worn_past import jittered, worn
+
+_COUNTED_SCANS = 2000
+_UNSEEN = 0.1  # returns, and as many drops, that are counted besides
 
 
 @dataclass(frozen=True)
@@ -35,12 +43,15 @@ class ForecasterConfig(Settings):
         past_scans: number of past scans that a scan is given.
         past_width: number of channels of the network over what past scans have on the present rays.
         past_blocks: number of its residual blocks.
+        own_past: share of the examples of training whose past ends with scans that the model samples itself, so that
+            generated drives do not fall apart; they are slow, and the model is to know something before.
     """
 
     pixels: PixelDecoderConfig = field(default_factory=lambda: PixelDecoderConfig(decoded_components=True))
     past_scans: Count = 5
     past_width: Count = 24
     past_blocks: Count = 2
+    own_past: Share = 0.0
 
 
 class Forecaster(Generator[ForecasterConfig, PixelSampling]):
@@ -62,7 +73,7 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
     def __init__(self, config: ForecasterConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         self.pixels = PixelDecoder(config.pixels, sensor, config.past_width, COMPONENTS, gaps=True)
-        self.past = PastNetwork(sensor.height, config.past_width, config.past_blocks, config.past_scans)
+        self.past = PastNetwork(sensor.height, sensor.width, config.past_width, config.past_blocks, config.past_scans)
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> ForecasterConfig:
@@ -75,9 +86,21 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
         """Return that scans are sampled given their past, or nothing."""
         return frozenset({Nothing, Past})
 
+    def fit_statistics(self, images: RangeImages) -> None:
+        """Take how often each ray returns in the training scans."""
+        indices = evenly_spaced(_COUNTED_SCANS, len(images))
+        total = torch.zeros_like(self.past.usual)
+        for index in indices:
+            total += images.batch([index]).return_mask[0]
+        self.past.usual.copy_(((total + _UNSEEN) / (len(indices) + 2 * _UNSEEN)).logit())
+
     def objective(self, stage: str) -> Objective:
         """Return the negative log-likelihood of the pixels."""
-        return ForecasterObjective(self.pixels, self.past) if stage == "pixels" else super().objective(stage)
+        return (
+            ForecasterObjective(self.pixels, self.past, self.config.own_past)
+            if stage == "pixels"
+            else super().objective(stage)
+        )
 
     def told(self, condition: Condition, count: int) -> Decoded:
         """Return what the past tells of each pixel of a number of scans."""
@@ -105,9 +128,18 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
 class ForecasterObjective(PixelObjective):
     """Negative log-likelihood of the pixels given their past, which in training is left out, worn or displaced."""
 
-    def __init__(self, pixels: PixelDecoder, past: PastNetwork) -> None:
+    kin = (PixelObjective,)
+
+    def __init__(self, pixels: PixelDecoder, past: PastNetwork, own_past: float) -> None:
         super().__init__(pixels)
-        self.past = past
+        self.past, self._own_past = past, own_past
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained forecaster, or what fits of a pixel decoder behind a tokenizer."""
+        if isinstance(trained, ForecasterObjective):
+            kept = super().weights_from(trained)
+            return {name: weight for name, weight in kept.items() if name != "past.usual"}  # of the scans at hand
+        return behind_past(trained.state_dict(), self.state_dict())
 
     def decoded(self, example: Example, rng: torch.Generator) -> Decoded:
         """Return what the past tells of each scan."""
@@ -115,8 +147,13 @@ class ForecasterObjective(PixelObjective):
         if not isinstance(past, Past):
             past = Past.nothing(self.sensor, len(example), 1).to(example.images.range_m.device)
         if self.training:
-            past = worn(past, rng)
+            past = worn(with_own(past, self._own_past, self._sampled, rng), rng)
         warped = warp(past)
         if self.training:
             warped = jittered(warped, rng)
         return self.past.told(warped, self.sensor)
+
+    @torch.no_grad()
+    def _sampled(self, past: Past, seeds: list[int]) -> RangeImage:
+        told = self.past.told(warp(past), self.sensor)
+        return self.pixels.sample(told, rngs_of(seeds), PixelSampling(range_temperature=1.0))  # others take longer

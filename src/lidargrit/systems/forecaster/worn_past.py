@@ -12,7 +12,7 @@ from lidargrit.scans.types import RangeImage
 from lidargrit.scans.warp import WarpedPast
 
 _NONE, _SCAN_LOST = 0.15, 0.15  # probability that there is no past, and that one scan of it lacks
-_THIN = 0.15  # that it is of generated scans, which keep few columns
+_THIN = 0.5  # that it is of generated scans, which keep few columns
 _TURN_RAD, _SHIFT_M = 1e-3, 0.02  # standard deviation of errors of a pose
 _JITTER_M = (0.0, 0.02, 0.06, 0.15)  # of ranges; one for each scan, half of it row by row
 
