@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import torch
 from jaxtyping import Int64
@@ -13,9 +14,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.pasts import Pasts
 from lidargrit.scans.augmentation import Augmentation, augment
-from lidargrit.scans.condition import NOTHING, Condition
+from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
-from lidargrit.scans.past import Past
 from lidargrit.scans.types import RangeImage
 
 _THREADS_AT_MOST = 128
@@ -105,17 +105,15 @@ class Batches:
         stride = self.images.sensor_of(indices[0]).column_stride
         columns = [int(torch.randint(stride, (1,), generator=rng)) for rng in rngs]
         first_columns = columns if self.any_columns else None
-        images, past = self.images.batch(indices, first_columns), None
+        example = Example(self.images.batch(indices, first_columns))
         if self._pasts is not None:
             gaps = [self._pasts.random_gap(index, rng) for index, rng in zip(indices, rngs, strict=True)]
-            past = self._pasts.of(indices, first_columns, gaps)
+            example = replace(example, condition=self._pasts.of(indices, first_columns, gaps))
         if self.augmentations:
-            told = NOTHING if past is None else past
-            each = [augment(Example(images, told)[i : i + 1], self.augmentations, rng) for i, rng in enumerate(rngs)]
-            images = RangeImage.cat([one.images for one in each])
-            past = past and Past.cat([one.condition for one in each if isinstance(one.condition, Past)])
-        told = NOTHING if self._condition_of is None else self._condition_of(images)
-        example = Example(images, told if past is None else past)
+            each = [augment(example[i : i + 1], self.augmentations, rng) for i, rng in enumerate(rngs)]
+            example = Example.cat(each)
+        if self._condition_of is not None and self._pasts is None:
+            example = replace(example, condition=self._condition_of(example.images))
         return example.with_keys() if self._with_keys else example
 
     def _scan_at(self, position: int) -> int:

@@ -69,6 +69,20 @@ class Condition:
                 given[each.name] = below or tensors[each.name]
         return cls(**given)
 
+    @classmethod
+    def cat(cls, parts: Sequence[Self]) -> Self:
+        """Return what is known of the scans of several batches as one; a plane is kept if every batch has it."""
+        made = copy(parts[0])  # checked already, as each part
+        vars(made).update({each.name: made._joined(each.name, parts) for each in fields(made)})
+        return made
+
+    def _joined(self, name: str, parts: "Sequence[Condition]") -> Any:
+        """Return a field of several batches as one."""
+        values = [getattr(part, name) for part in parts]
+        if isinstance(values[0], Mapping):
+            return common_planes(values, torch.cat)
+        return torch.cat(values) if isinstance(values[0], Tensor) else sensor_of_all(values)
+
     def _mapped(self, change: Callable[[Tensor], Tensor]) -> Self:
         made = copy(self)  # the scans were checked already, and a check would wait for their device
         for name, value in ((each.name, getattr(self, each.name)) for each in fields(self)):
@@ -175,18 +189,10 @@ class Observed(Condition):
         one = cls(none.float(), none, none, none, sensor)
         return one._mapped(lambda unknown: torch.zeros((count, *unknown.shape[1:]), dtype=unknown.dtype, device=device))
 
-    @classmethod
-    def cat(cls, parts: Sequence[Self]) -> Self:
-        """Return the conditions of several batches as one; a plane is kept if every batch has it."""
-        return cls(
-            torch.cat([one.range_m for one in parts]),
-            torch.cat([one.range_observed for one in parts]),
-            torch.cat([one.return_mask for one in parts]),
-            torch.cat([one.return_observed for one in parts]),
-            sensor_of_all([one.sensor for one in parts]),
-            common_planes([one.planes for one in parts], torch.cat),
-            _earlier_seeds(parts),
-        )
+    def _joined(self, name: str, parts: Sequence[Condition]) -> Any:
+        if name == "earlier_seeds":
+            return _earlier_seeds([part for part in parts if isinstance(part, Observed)])
+        return super()._joined(name, parts)
 
     @property
     def reflectance(self) -> Float[Tensor, "B H W"] | None:

@@ -1,6 +1,7 @@
 """One batch of training examples: range images, and what a generator is told of each."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -32,6 +33,12 @@ class Example:
         if keys is not None:
             keys = keys[index] if isinstance(index, slice) else tuple(keys[number] for number in index)
         return Example(self.images[index], self.condition[index], keys)
+
+    @classmethod
+    def cat(cls, parts: "Sequence[Example]") -> "Example":
+        """Return the examples of several batches, whose conditions are of one kind, as one, without keys."""
+        conditions = [part.condition for part in parts]
+        return cls(RangeImage.cat([part.images for part in parts]), type(conditions[0]).cat(conditions))
 
     def to(self, device: torch.device | str) -> "Example":
         """Return the examples with their tensors on another device."""

@@ -1,7 +1,6 @@
 """The scans of a drive before the present one, as range images with their poses → :class:`Past`."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +10,6 @@ from torch import Tensor
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import sensor_of_all
 
 _ROTATION = 1e-3  # by which numbers of a file may miss an orthonormal matrix
 
@@ -68,16 +66,6 @@ class Past(Condition):
         images = torch.zeros(count, scans, sensor.height, sensor.width * sensor.column_stride)
         still = torch.eye(4, dtype=torch.float64).expand(count, scans, 4, 4).clone()
         return cls(images, still, torch.zeros(count, scans, dtype=torch.float64), sensor)
-
-    @classmethod
-    def cat(cls, parts: "Sequence[Past]") -> "Past":
-        """Return the pasts of several batches, all of equally many scans, as one."""
-        return cls(
-            torch.cat([part.range_m for part in parts]),
-            torch.cat([part.transforms for part in parts]),
-            torch.cat([part.ages_s for part in parts]),
-            sensor_of_all([part.sensor for part in parts]),
-        )
 
     @property
     def has_return(self) -> Bool[Tensor, "B"]:

@@ -17,14 +17,13 @@ import numpy as np
 
 from lidargrit.core.errors import DataError
 from lidargrit.data.images import Pixels
-from lidargrit.data.prepared.plan import ARRAYS, ImageFacts, PreparedSpec
+from lidargrit.data.prepared.plan import ARRAYS, STORED_AS, ImageFacts, PreparedSpec
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
 if TYPE_CHECKING:
     from tensorstore import Context, TensorStore
 
-_DTYPES = {"range": "uint16", "reflectance": "uint8", "label": "uint16"}
 _FINEST_STEP_M = 0.002  # a tenth of the scatter of a good sensor; 16 bits of it reach 131 m
 _RETRIES = {"max_retries": 5}  # of a request to a store; the library's own 32 would take many minutes
 _CACHE_BYTES = 2**26
@@ -166,7 +165,7 @@ class ImageArrays:
     def _described(self, name: str) -> dict[str, Any]:
         """Return the array's description: an array that is there and differs in any part of it is not opened."""
         image, numbers = [1, *self._shape], {"name": "bytes", "configuration": {"endian": "little"}}
-        typesize, checksum = np.dtype(_DTYPES[name]).itemsize, {"name": "crc32c"}
+        typesize, checksum = np.dtype(STORED_AS[name]).itemsize, {"name": "crc32c"}
         # 98 KB for a KITTI scan as 64x1024; level 1 takes 4 % more room, level 5 no less.
         settings = {"cname": "zstd", "clevel": 3, "shuffle": "shuffle", "typesize": typesize, "blocksize": 0}
         chunk = [numbers if typesize > 1 else {"name": "bytes"}, {"name": "blosc", "configuration": settings}, checksum]
@@ -180,7 +179,7 @@ class ImageArrays:
             "store_data_equal_to_fill_value": True,  # else a shard of zeros could not be told from one that is lost
             "metadata": {
                 "shape": [self._spec.num_scans, *self._shape],
-                "data_type": _DTYPES[name],
+                "data_type": STORED_AS[name],
                 "fill_value": 0,
                 "chunk_grid": grid,
                 "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
 PLAN_FILE, SCANS_FILE, ARRAYS, MADE_FOLDER = "plan.json", "scans.json", "images.zarr", "made"
-PLANES = ("range", "reflectance", "label")  # arrays of a store
+STORED_AS = {"range": "uint16", "reflectance": "uint8", "label": "uint16"}  # the arrays of a store
 FORMAT = 5  # to be raised whenever projection or simulation give other pixels for the same scan
 
 

@@ -16,7 +16,15 @@ from lidargrit.core.files import read_json
 from lidargrit.core.untrusted import JSON_BYTES_AT_MOST, parse_json, user_path
 from lidargrit.data.images import ImageStore, Pixels, Provenance, TimedStore
 from lidargrit.data.prepared.arrays import ImageArrays, damaged, range_step_m, store_context, store_errors, store_of
-from lidargrit.data.prepared.plan import PLAN_FILE, PLANES, SCANS_FILE, MadeScans, PreparedSpec, made_name, pixels_name
+from lidargrit.data.prepared.plan import (
+    PLAN_FILE,
+    SCANS_FILE,
+    STORED_AS,
+    MadeScans,
+    PreparedSpec,
+    made_name,
+    pixels_name,
+)
 from lidargrit.scans.motion import Motion
 from lidargrit.scans.sensors import SensorModel
 
@@ -133,7 +141,7 @@ class PreparedFolder:
         """Return what is there of a shard on this machine; nothing where one of its files is lost or damaged."""
         try:
             made = self.read_made(shard)
-            files = {name: Path(self.location, pixels_name(name, shard)) for name in PLANES}
+            files = {name: Path(self.location, pixels_name(name, shard)) for name in STORED_AS}
             sizes = {name: file.stat().st_size for name, file in files.items() if file.is_file()}
         except (DataError, OSError):
             return MadeScans()

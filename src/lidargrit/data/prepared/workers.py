@@ -26,7 +26,7 @@ from lidargrit.core.processes import module_command
 from lidargrit.core.shares import each_done
 from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.arrays import ImageArrays, facts_of, stored
-from lidargrit.data.prepared.plan import ARRAYS, PLANES, MadeScans, PreparedSpec, made_name, pixels_name
+from lidargrit.data.prepared.plan import ARRAYS, STORED_AS, MadeScans, PreparedSpec, made_name, pixels_name
 from lidargrit.data.prepared.prepared import PreparedFolder
 from lidargrit.scans.projection import project, variant_named
 from lidargrit.scans.sensors import SensorModel
@@ -139,7 +139,7 @@ class ShardWriter:
 
     def __init__(self, folder: Path, spec: PreparedSpec, shard: int) -> None:
         self._path, self._spec = folder / made_name(shard), spec
-        self._files = {name: folder / pixels_name(name, shard) for name in PLANES}
+        self._files = {name: folder / pixels_name(name, shard) for name in STORED_AS}
         self._arrays = ImageArrays(str(folder), spec)
         kept, self._waiting = PreparedFolder(str(folder)).kept(shard), dict[int, dict[str, np.ndarray]]()
         self._made = kept if set(kept.scans) <= set(spec.scans_of(shard)) else MadeScans()
