@@ -211,6 +211,8 @@ def test_a_setting_of_another_type_and_a_word_that_is_no_choice_are_refused(name
             wrong, wanted = [1.5, "a", True], "whole number"
         elif hint in (float, float | None):
             wrong, wanted = ["1", [1.0]], "number"
+        elif hint is bool:
+            wrong, wanted = [1, "true", None], "true or false"
         assert wrong, f"no wrong value of {setting} is known here"
         for value in wrong:
             with pytest.raises(ConfigError, match=rf"^got {setting}={re.escape(repr(value))}; wanted .*{wanted}"):
