@@ -172,7 +172,7 @@ def test_drives_are_scored_from_the_command_line(drives, tmp_path, monkeypatch, 
 
 def test_what_cannot_be_forecast_is_told(drives, tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
-    with pytest.raises(ConfigError, match="pretrained, which takes no past"):
-        evaluate_forecast(str(drives), EvalConfig("forecast"), "pretrained")
+    with pytest.raises(ConfigError, match="pretrained/lidargrit, which takes no past"):
+        evaluate_forecast(str(drives), EvalConfig("forecast"), "pretrained/lidargrit")
     with pytest.raises(DataError, match="none follows another in a drive"):
         evaluate_forecast("simulated:2:test", EvalConfig("forecast"))
