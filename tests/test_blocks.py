@@ -24,7 +24,7 @@ from tiny_runs import MODEL, SHORT, SIMULATED
 SETTINGS = (
     *MODEL,
     "model.tokenizer.dropout=0.2",
-    *[f"model.transformer.{part}_dropout=0.2" for part in ("embedding", "residual", "attention")],
+    *[f"model.transformer.{part}_dropout=0.2" for part in ("embedding", "residual")],
 )
 
 

@@ -36,7 +36,7 @@ SENSOR = load_sensor("hdl64e_kitti_odometry")
 
 STEADY = [  # no random numbers of a process, only of a scan; codes that restart and follow means
     "model.tokenizer.dropout=0",
-    *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "attention", "residual")],
+    *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "residual")],
     "training.tokenizer.augmentations=[flip,roll]",
     *[f"training.{stage}.precision=fp32" for stage in ("tokenizer", "transformer")],
     "training.tokenizer.scans=48",
