@@ -236,7 +236,7 @@ def growth() -> None:
     rows: dict[str, Callable[[int], Any]] = {
         "Chamfer matrix": lambda n: matching.chamfer_matrix(clouds_of(n, 0), clouds_of(n, 1)),
         "bev_mmd": lambda n: discrepancy(*counts[n], frobenius, unbiased=True),
-        "lidm_bev_matching": lambda n: ways_between(*cells[n], 200),
+        "lidm_bev_matching": lambda n: ways_between(cells[n][0], cells[n][1], 200),
     }
     for name, work in rows.items():
         print(f"{name:<52}" + "".join(f"{timed(lambda: work(n))[0]:>12.3f}" for n in (50, 100, 200)), flush=True)  # noqa: B023

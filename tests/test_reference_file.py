@@ -12,11 +12,12 @@ import seeded_networks
 from lidargrit import api
 from lidargrit.cli import main
 from lidargrit.core.arrays import read_arrays
-from lidargrit.core.errors import ConfigError, LidarGritError
+from lidargrit.core.errors import ConfigError, DataError, LidarGritError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.evaluation import reference_file as module
 from lidargrit.evaluation.comparison import EvalConfig, compare_sources, save_reference
 from lidargrit.evaluation.intervals import Resampling
+from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
 from lidargrit.evaluation.metrics.shared.networks.frechet import Moments, frechet_distance
 from lidargrit.evaluation.reference_file import ReferenceFile
 from tiny_runs import the_one_line
@@ -68,6 +69,16 @@ def test_moments_are_restored_bit_for_bit():
     np.testing.assert_allclose(covariance, np.cov(rows.T), atol=1e-12)
 
 
+def test_counts_are_kept_small_and_add_up_again():
+    seen, again = SumAccumulator(), SumAccumulator()
+    seen.add(np.array([0, 255, 3]))
+    assert seen.arrays()["total"].dtype == np.uint8, "4 MB for LiDM's cells, not 32 for each of 16 groups"
+    for _ in range(2):
+        again.restore(seen.arrays())
+        again.merge(seen)
+    assert again.value().tolist() == [0, 510, 6]
+
+
 def test_the_file_holds_sums_and_no_scan(path, monkeypatch, tmp_path):
     (jsd,) = [each for each in ReferenceFile(path).contents.metrics if each.metric == "bev_jsd"]
     with path.open("rb") as file:
@@ -80,6 +91,9 @@ def test_the_file_holds_sums_and_no_scan(path, monkeypatch, tmp_path):
         near = (image.range_m > 3) & (image.range_m < 70)
         points += int(near.sum())
     assert total == pytest.approx(points, abs=2)  # ranges of points are rounded otherwise, by the limits
+    monkeypatch.setattr(module, "METRIC_BYTES_AT_MOST", 0)
+    with pytest.raises(DataError, match="would hold nothing: sliced_wasserstein: it would take"):
+        save_reference(REAL, tmp_path / "small.lgref", PLAIN)
     monkeypatch.setattr(module, "METRIC_BYTES_AT_MOST", 100_000)
     small = save_reference(REAL, tmp_path / "small.lgref", PLAIN)
     missing = [each.metric for each in small.contents.metrics if each.why_not]

@@ -282,6 +282,9 @@ def write_reference(
     arrays: dict[str, np.ndarray] = {}
     metrics = [_filed(factory, each, arrays, keep_all) for factory, each in kept]
     source, provenance = reference.source, reference.images.provenance
+    if all(each.why_not for each in metrics):
+        got = f"{source.text}, of which {path} would hold nothing: {metrics[0].metric}: {metrics[0].why_not}"
+        raise DataError(got, "one metric at least", "name the metrics by --metrics, or take fewer scans by -n")
     contents = Contents(
         *protocol,
         __version__,
