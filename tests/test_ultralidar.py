@@ -14,7 +14,7 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.ultralidar import system
 from lidargrit.systems.ultralidar.swin import SwinConfig
-from lidargrit.systems.ultralidar.system import CodebookCare, UltraLidar, UltraLidarConfig, VoxelSampling
+from lidargrit.systems.ultralidar.system import CodebookRestart, UltraLidar, UltraLidarConfig, VoxelSampling
 from lidargrit.systems.ultralidar.voxel_autoencoder import VoxelAutoencoderConfig
 from lidargrit.systems.ultralidar.voxel_prior import FillSampling, forbid, generate_tokens, likeliest_codes
 from lidargrit.systems.ultralidar.voxels import VoxelGrid, images_of_voxels, voxels_of_images
@@ -101,7 +101,7 @@ def test_codes_that_lie_idle_are_moved_to_where_latents_are(monkeypatch):
     monkeypatch.setattr(system, "_IDLE_STEPS", 8)
     rng = torch.Generator().manual_seed(0)
     centres = 5 * torch.randn(16, 4, generator=rng)
-    codes, care = torch.zeros(16, 4), CodebookCare(16, 4)
+    codes, care = torch.zeros(16, 4), CodebookRestart(16, 4)
     codes[0] = 1.0
 
     def step():
