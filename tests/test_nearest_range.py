@@ -106,7 +106,7 @@ def test_a_generator_over_such_tokens_trains_with_a_pixel_decoder_samples_and_te
         TransformerConfig(layers=1, heads=2, width=16),
         PIXELS,
     )
-    fit = TrainingConfig(scans=24, batch_size=4, learning_rate=1e-2, average_over_scans=0)
+    fit = TrainingConfig(scans=8, batch_size=4, learning_rate=1e-2, average_over_scans=0)
     data = DataConfig(("simulated:6:train",), ("simulated:2:val",), columns=512, column_stride=8)
     stages = {"tokenizer": fit, "transformer": fit, "pixels": fit}
     preset = Preset(title="", generator="lidargrit", model=config, data=data, training=stages)

@@ -188,7 +188,6 @@ def test_what_a_user_calls_so_goes_first(model, tmp_path, monkeypatch):
 def test_every_verb_that_takes_a_run_takes_the_word(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(LidarGrit, "own_batches", (1, 1))  # else eight scans are computed for one
-    assert main(["view", "pretrained", "-n", "1", "-o", "page.html"]) == 0
     few = ["--reference", "simulated:2:test", "-n", "2", "--metrics", "bev_jsd"]
     assert main(["compare", "table", "pretrained", *few]) == 0
     words = ["data.train=simulated:2:train", "data.val=simulated:1:val", "training.tokenizer.start=frozen:pretrained"]
