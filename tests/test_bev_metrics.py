@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.distance import jensenshannon
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.evaluation.metrics import bev_mmd, load_metric
+from lidargrit.evaluation.metrics import bev_mmd, load_metric, update_together
 from lidargrit.evaluation.metrics import lidm_bev_matching as matching
 from lidargrit.evaluation.metrics.shared import birds_eye as above
 from lidargrit.scans.projection import points_of_pixels
@@ -172,26 +172,43 @@ def test_lidm_jsd_is_that_of_a_slow_loop():
     )
 
 
-def test_lidm_matching_is_that_of_a_slow_loop():
-    generated, real = random_images(0, 4), random_images(1, 3)
+@pytest.mark.parametrize(("variant", "width_m"), [("exact", 0.5), ("r3dpa", 0.05)])
+def test_matching_is_that_of_a_slow_loop(variant, width_m):
+    generated, real = random_images(0, 3), random_images(1, 2)
     cells = [
-        [np.array(sorted(slow_cells(images[index], 0.5))) / 200 for index in range(len(images))]
+        [np.array(sorted(slow_cells(images[index], width_m))) * width_m / 100 for index in range(len(images))]
         for images in (generated, real)
     ]
     slow = []
     for one in cells[1]:
         apart = [((one[:, None] - other) ** 2).sum(axis=2) for other in cells[0]]
         slow.append(min((square.min(axis=0).mean() + square.min(axis=1).mean()) / 2 for square in apart))
-    assert score("lidm_bev_matching", generated, real) == pytest.approx(np.mean(slow), rel=1e-12)
+    assert score("lidm_bev_matching", generated, real, variant=variant) == pytest.approx(np.mean(slow), rel=1e-12)
 
 
-def test_lidm_matching_in_blocks(monkeypatch):
-    bits = matching.LidmBevMatching().summarise(random_images(3, 7), real=True)
-    whole = matching.pair_distances(bits, bits)
-    assert np.allclose(whole, whole.T)
-    assert (np.diag(whole) == 0).all()
+def test_halves_take_the_ways_of_the_whole_sets(monkeypatch):
+    generated, real = random_images(3, 7), random_images(4, 6)
+    whole = matching.LidmBevMatching()
+    update_together([(whole, False)], generated)
+    update_together([(whole, True)], real)
     monkeypatch.setattr(matching, "_BLOCK", 3)
-    assert np.allclose(matching.pair_distances(bits, bits), whole, rtol=1e-12, atol=1e-18)
+    once = whole.compute().value
+    for some, others in ((generated[:4], real[2:]), (real[:3], real[3:])):  # the second is real against real
+        expected = score("lidm_bev_matching", some, others)
+        half = matching.LidmBevMatching()
+        half.choose_as(whole)
+        update_together([(half, False)], some)
+        update_together([(half, True)], others)
+        with monkeypatch.context() as without:
+            without.setattr(matching, "ways_between", None)
+            assert half.compute().value == expected != once
+
+
+@given(st.sets(st.integers(0, 4_000_000 - 1), min_size=1), st.sets(st.integers(0, 300_000), min_size=1))
+def test_cells_are_packed_and_found_again(first, second):
+    cells = [np.array(sorted(scan)) for scan in (first, second)]
+    found, begins = matching.unpacked(np.concatenate([matching.packed(each) for each in cells]))
+    assert [each.tolist() for each in np.split(found, begins[1:])] == [each.tolist() for each in cells]
 
 
 # The definitions

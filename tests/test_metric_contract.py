@@ -12,7 +12,7 @@ import torch
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, UnknownNameError
-from lidargrit.evaluation.metrics import Metric, load_metric
+from lidargrit.evaluation.metrics import Metric, lidm_bev_matching, load_metric
 from lidargrit.evaluation.metrics.shared import clouds
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
 from lidargrit.evaluation.metrics.shared.labelled import LabelMetric
@@ -38,6 +38,7 @@ def _network(name, monkeypatch):
     What is found in an image alone, by a network or by sampling far points, is not looked for again in another test.
     """
     monkeypatch.setattr(clouds, "sampled_clouds", sampled_once)
+    monkeypatch.setitem(lidm_bev_matching.CELLS_PER_M, "r3dpa", 3)  # 20 take half a second for each scan
     if issubclass(load_metric(name), LabelMetric):
         monkeypatch.setattr(sys.modules[LabelMetric.__module__], "segmenter_of", lambda sensor, named: None)
     elif load_metric(name).needs_weights:

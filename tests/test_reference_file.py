@@ -202,3 +202,9 @@ def test_fewer_samples_and_samples_of_other_rays_are_refused(path, tmp_path):
             np.save(tmp_path / name / f"{number}.npy", np.ones((64, columns), np.float32))
         with pytest.raises(LidarGritError, match=lines[name]):
             compare_sources(str(tmp_path / name), str(path), SETTINGS)
+    (tmp_path / "r2dm").mkdir()
+    torch.save(torch.ones(5, 64, 1024), tmp_path / "r2dm" / "samples_0000000.pth")
+    with pytest.raises(
+        ConfigError, match=r"of hdl64e_kitti_360 \(64x1024\), and .* scans as .*; have a file made with"
+    ):
+        compare_sources(str(tmp_path / "r2dm"), str(path), dataclasses.replace(SETTINGS, data=DataConfig(workers=1)))

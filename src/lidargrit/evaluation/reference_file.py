@@ -25,7 +25,7 @@ from lidargrit.evaluation.intervals import Part, Resampling, blocks
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, EvalSet, Opened, paired
 from lidargrit.evaluation.protocols import Protocol
-from lidargrit.evaluation.scorecard import EvalSetRecord
+from lidargrit.evaluation.scorecard import EvalSetRecord, by_reason
 from lidargrit.evaluation.scoring import KeptOfReal, MetricFactory
 from lidargrit.scans.sensors import SensorModel
 
@@ -120,6 +120,10 @@ class ReferenceFile:
         config = replace(config, max_scans=at_most, projection_variant=kept.projection_variant or "exact")
         samples = samples.cut(protocol.first_points) if protocol.first_points else samples
         first = Opened.of(samples, self.sensor, config)
+        if not (sensor := first.images.sensor).same_rays(self.sensor):
+            ours, theirs = (f"{each.name} ({each.height}x{each.width})" for each in (sensor, self.sensor))
+            got = f"range images of {ours}, and {self.path} of scans as {theirs} sees them"
+            raise ConfigError(got, "the same rays", "have a file made with --sensor and --set data.columns of these")
         if len(first.images) < count:
             got = f"{counted_scans(len(first.images))} in {samples.text}, and a reference file of {count:,}"
             raise ConfigError(got, f"{count:,} samples or more", "sample more, or make a reference file with -n")
@@ -162,13 +166,12 @@ class ReferenceFile:
     def as_text(self) -> str:
         """Return what the file holds as lines for a person."""
         kept = self.contents
-        missing = [each for each in kept.metrics if each.why_not]
-        named = ", ".join(f"{each.metric} ({each.variant})" for each in kept.metrics if not each.why_not)
+        named = {f"{each.metric} ({each.variant})": each.why_not for each in kept.metrics}
         lines = [
             f"{self.path}: {self.path.stat().st_size / 1e6:.1f} MB, sums over {counted_scans(kept.set.scans_used)} of "
             f"{kept.set.source}, which it does not hold; protocol {kept.protocol}; sha256 {self.sha256}",
-            f"holds: {named}",
-            *(f"not held: {each.metric} ({each.variant}): {each.why_not}" for each in missing),
+            f"holds: {', '.join(name for name, why_not in named.items() if not why_not)}",
+            *by_reason(("not held", name, why_not) for name, why_not in named.items() if why_not),
             f"score with: lidargrit evaluate SAMPLES {self.path} --protocol {kept.protocol}",
         ]
         return "\n".join(lines)

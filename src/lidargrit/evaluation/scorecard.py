@@ -1,5 +1,6 @@
 """The result of an evaluation, with everything needed to repeat it: scores → table, JSON, and back."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,11 @@ class Scorecard:
         left_out = [(each.metric, each.variant) for each in self.left_out]
         return verdict(self.scores, self.reference.scans_used, left_out, self.leak)
 
+    @property
+    def departures(self) -> list[str]:
+        """A sentence for each difference of the protocol from its source, the faults that it keeps among them."""
+        return [f"{self.protocol} and its source: {each}" for each in self.about.get("departures", ())]
+
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain values, for a file, with a hash of all: :meth:`read` refuses what was altered."""
         data = {
@@ -155,12 +161,25 @@ class Scorecard:
         rows = [_row(score) for score in self.scores]
         rows += [(each.metric, each.variant or "-", each.verdict, *[""] * 5) for each in self.left_out]
         notes = notes_on_floors(self.scores)
-        notes += [f"{each.verdict}: {each.metric}: {each.why}" for each in self.left_out]
+        notes += by_reason((each.verdict, each.metric, each.why) for each in self.left_out)
         notes += [f"not the protocol {self.protocol}: {each}" for each in self.deviations]
+        notes += self.departures
         versions = sorted({*self.samples.streets, *self.reference.streets})
         notes += [f"simulated streets: {', '.join(versions)}"] * bool(versions)
         table = Table(_HEAD, tuple(rows), sentences=(*self.verdict.sentences, ""), notes=tuple(notes))
         return table.without_empty("pixel statistics").as_text()
+
+
+def by_reason(missing: Iterable[tuple[str, str, str]]) -> list[str]:
+    """Return a sentence for each reason, with all that are missing for it.
+
+    Args:
+        missing: triples of the words in place of a number, a metric, and the reason.
+    """
+    names: dict[tuple[str, str], list[str]] = {}
+    for words, name, why in missing:
+        names.setdefault((words, why), []).append(name)
+    return [f"{words}: {', '.join(some)}: {why}" for (words, why), some in names.items()]
 
 
 def _row(score: Score) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from lidargrit.core.errors import DataError
 from lidargrit.core.files import write_json
 from lidargrit.core.table import Table
 from lidargrit.evaluation.intervals import Estimate, Resampling, Score, blocks, format_value, spread_of
-from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard
+from lidargrit.evaluation.scorecard import NOT_APPLICABLE, LeftOut, Scorecard, by_reason
 from lidargrit.evaluation.verdict import (
     ENOUGH,
     MEMORISED,
@@ -151,9 +151,10 @@ def _measured(cards: Sequence[NamedCard]) -> tuple[Table, ...]:
         cells = not_applicable | {column_of(score): _cell(score) for score in card.scores}
         rows.append((f"{name}{_BOUNDS.get(_system(name), '')}", *(cells.get(column, "") for column in columns)))
         missing = [each for each in card.left_out if each not in _not_applicable(card)]
-        left_out = [f"left out: {each.metric} ({each.variant}): {each.why}" for each in missing]
+        left_out = by_reason(("left out", f"{each.metric} ({each.variant})", each.why) for each in missing)
         notes += [f"{name}: {text}" for text in (*card.deviations, *card.warnings, *left_out)]
     card = cards[0][1]
+    notes += card.departures
     reference_row = {
         column_of(score): score.real_against_real
         for _, of in reversed(cards)  # of the first that has it

@@ -28,6 +28,7 @@ lidarcrafter = Protocol(
         "degrees lie between two rows each, and noise decides",
         "the program takes the first 10,000 scans of its list; here they are evenly spaced",
         "the program's Fréchet range distance is by a network of its own, and is not built",
+        "its files of histograms and distances could not be read: R2DM's, whose names they have, stand in for them",
         "the program compares measured points of real scans with samples on the edges of pixels, and with clouds as "
         "they are, without the limits; here all lie on the rays through the centres, within the limits",
     ),

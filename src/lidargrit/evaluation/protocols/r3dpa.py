@@ -5,6 +5,14 @@ from dataclasses import replace
 from lidargrit.evaluation.protocols import MetricChoice
 from lidargrit.evaluation.protocols import lidm as _lidm
 
+OF_BOTH_NUMBERS = (
+    "a fault of the program, kept: it moves points above +3 and below -25 degrees into its outer rows",
+    "the program puts the points of both sets on the edges of pixels, half a row and half a column away from their "
+    "centres; here both sets lie on the rays through the centres",
+    "the program takes points from 1 m on; here those nearer than 1.45 m are left out, and hide what lies behind",
+)
+"""Departures that the protocol of its "MMD" shares."""
+
 r3dpa = replace(
     _lidm.lidm,
     title="R3DPA on KITTI-360, 64x1024",
@@ -13,11 +21,9 @@ r3dpa = replace(
     num_scans=10000,
     splits=("test", "paper/test", "lidargrit-code/test", "lidargen-code/test"),
     departures=(
-        "a fault of the program, kept: it moves points above +3 and below -25 degrees into its outer rows",
+        *OF_BOTH_NUMBERS,
         "the program compares the first 10,000 samples with all 30,758 scans; here with equally many, evenly spaced",
-        "its MMD is LiDM's formula with cells of 5 cm in place of 50, of 2,000 samples and 1,000 scans: another number "
-        "than LiDM's under one name, and not built",
+        "its MMD is of fewer scans: the protocol r3dpa-mmd",
         "the distances between features of trained networks (FRID, FLD, FSVD, FPVD) are not built",
-        "the program takes points from 1 m on; here those nearer than 1.45 m are left out, and hide what lies behind",
     ),
 )
