@@ -15,6 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 from scipy import ndimage
 
 from lidargrit.core import discovery
@@ -30,6 +33,7 @@ from lidargrit.simulator import simulate
 SENSOR = load_sensor("hdl64e_kitti_odometry")
 _FIRST_SEED = 2_000_000  # the simulator's first test street
 _BLOCK = 20  # streets whose features are computed together; sets are chosen from blocks
+_SHOWN = slice(256, 768)  # columns of a picture, about straight ahead
 _WAYS = 10  # of choosing both sets
 _NOT_DAMAGED = ("reflectance_histogram",)
 _VEHICLE = [number for number, of_class in CLASSES.items() if of_class.learned in (10, 18, 20)]
@@ -176,13 +180,39 @@ def seen(folder: Path, blocks: int, numbers: Sequence[int], processes: int) -> l
     return rows
 
 
+def _plot(path: Path, seed: int) -> None:
+    """Plot a street at 64x1024 and its damages, one above the other, in colours of 2 to 80 m."""
+    sensor = SENSOR.with_columns(1024)
+    street = RangeImage.stack([project(simulate(seed, sensor), sensor)])
+    damages = {
+        "a simulated street": street,
+        "ranges blurred": blurred(street, 5),
+        "vehicles removed": without_vehicles(street, 1),
+        "boxes as vehicles": boxes_for_vehicles(street),
+    }
+    figure = Figure(figsize=(9.6, 0.85 * len(damages)), dpi=100)
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(damages), 1, gridspec_kw={"hspace": 0.06})
+    for axes, (name, images) in zip(grid, damages.items(), strict=True):
+        range_m = images.range_m[0, :, _SHOWN].numpy()
+        look = {"cmap": "turbo", "norm": LogNorm(2, 80), "aspect": "auto", "interpolation": "none"}
+        axes.imshow(np.where(range_m > 0, range_m, np.nan), **look)
+        axes.set(xticks=[], yticks=[])
+        axes.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=9)
+    figure.subplots_adjust(left=0.15, right=0.998, top=0.99, bottom=0.01)
+    figure.savefig(path)
+
+
 def _main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--picture", type=int, metavar="SEED", help="plot this street and its damages into OUT instead")
     parser.add_argument("streets", type=Path, help="folder that keeps the simulated streets")
     parser.add_argument("out", type=Path)
     parser.add_argument("--scans", type=int, nargs="+", default=[100, 300], help="numbers of scans in each set")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     given = parser.parse_args()
+    if given.picture is not None:
+        return _plot(given.out, given.picture)
     rows = seen(given.streets, 2 * max(given.scans) // _BLOCK, given.scans, given.processes)
     with atomic_path(given.out) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")

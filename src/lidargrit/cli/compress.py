@@ -8,8 +8,9 @@ from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit compress /data/kitti_odometry scans.lgz
-  lidargrit compress /data/drive drive.lgz --step-mm 2 --model runs/mine
-  lidargrit decompress drive.lgz restored --model runs/mine
+  lidargrit compress /data/scans fine.lgz --step-mm 2 --model runs/mine
+  lidargrit compress /data/drive drive.lgz --model pretrained/forecaster      each scan given those before it
+  lidargrit decompress fine.lgz restored --model runs/mine
 """
 
 

@@ -22,7 +22,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.data.scan_folder import KittiTree, ScanFolder
 from lidargrit.data.sources import open_source
 from lidargrit.data.trajectories import read_trajectory
-from lidargrit.data.windows import TimedScan, drives_in
+from lidargrit.data.windows import drives_in
 from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, SamplingT, load
 from lidargrit.inference.samples import sampling_identity
@@ -105,7 +105,7 @@ def continued(drive: str, sensor: SensorModel, frames: int, after: int | None, c
         constant_speed: whether later poses of the drive are left alone. Where it has none, the last step is repeated.
     """
     dataset = open_source(drive).scans()
-    scans = [TimedScan(dataset.name(at), dataset.recording(at), dataset.motion(at)) for at in range(len(dataset))]
+    scans = dataset.timed_scans()
     numbers = max(drives_in(scans), key=lambda one: (len(one) > 1, one[-1:]), default=[])
     last = len(numbers) - 1 if after is None else after
     if not 1 <= last < len(numbers):

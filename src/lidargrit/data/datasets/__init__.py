@@ -3,7 +3,7 @@
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -117,6 +117,11 @@ class ScanDataset(ABC):
         """
         return Motion()
 
+    def timed_scans(self, indices: Iterable[int] | None = None) -> list[TimedScan]:
+        """Return when and where scans were made, as far as that is known; all of them if no indices are given."""
+        some = range(len(self)) if indices is None else indices
+        return [TimedScan(self.name(at), self.recording(at), self.motion(at)) for at in some]
+
     def windows(self, frames: int) -> "list[Window]":
         """Return all runs of scans that follow one another in one drive, in order of time.
 
@@ -132,7 +137,7 @@ class ScanDataset(ABC):
         """
         if frames < 1:
             raise ConfigError(f"windows of {frames} scans", "at least 1", "correct it")
-        scans = [TimedScan(self.name(at), self.recording(at), self.motion(at)) for at in range(len(self))]
+        scans = self.timed_scans()
         return [
             Window(self, tuple(drive[first : first + frames]))
             for drive in drives_in(scans, with_poses=False)

@@ -16,6 +16,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.source import Source
+from lidargrit.data.windows import TimedScan
 from lidargrit.scans.many_scans import usable_scans
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
@@ -49,6 +50,10 @@ class NamedScans(ABC):
     def timed(self, index: int) -> Scan:
         """Return the points of a scan with its time and pose, where files beside it tell them."""
         return self.scan(index)
+
+    @abstractmethod
+    def timed_scans(self) -> list[TimedScan]:
+        """Return when and where each scan was made, where that is known."""
 
     def path(self, index: int) -> Path | None:
         """Return the file that holds the points of a scan; None where there is none."""
@@ -98,6 +103,10 @@ class PointScans(NamedScans):
         (scan,) = Window(self._dataset, (self._indices[index],)).scans()
         return scan
 
+    def timed_scans(self) -> list[TimedScan]:
+        """Return times and poses by files beside the scans."""
+        return self._dataset.timed_scans(self._indices)
+
     def tell_notes(self, scan: Scan) -> None:
         """Report what is noted of the data set and of a scan; notes that differ in numbers alone once."""
         for of, notes in ((str(self._dataset.root), self._dataset.notes), (scan.source, scan.notes)):
@@ -145,6 +154,11 @@ class ImageScans(NamedScans):
     def image(self, index: int) -> RangeImage:
         """Return its pixels (H, W)."""
         return self.images.batch([self._numbers[index]])[0]
+
+    def timed_scans(self) -> list[TimedScan]:
+        """Return times and poses that were kept with the images."""
+        timed = self.images.timed_scans()
+        return [timed[number] for number in self._numbers]
 
     def scan(self, index: int) -> Scan:
         """Return a point for each return."""

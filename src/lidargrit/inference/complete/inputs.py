@@ -17,6 +17,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
+from lidargrit.data.windows import TimedScan
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.scans.projection import (
@@ -115,6 +116,10 @@ class Inputs:
     def number(self, index: int) -> int:
         """Return its number in the source, whatever other scans are taken."""
         return self._scans.number(index)
+
+    def timed_scans(self) -> list[TimedScan]:
+        """Return when and where each scan was made, where that is known."""
+        return self._scans.timed_scans()
 
     def check_output(self, out: Path) -> None:
         """Refuse a folder whose files would become scans of the source, with an OutputError."""

@@ -20,6 +20,7 @@ from lidargrit.generation.generator import load
 from lidargrit.inference.complete.inputs import Inputs, ScanReader, open_inputs
 from lidargrit.inference.compress.archive import Archive, add_scan, writing
 from lidargrit.inference.compress.coder import not_reproduced
+from lidargrit.inference.compress.drives import DrivesOfSource, Place, PlacedScan, past_of
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
@@ -56,7 +57,9 @@ def compress_scans(
     ray: str = "",
     sensor: SensorModel | None = None,
 ) -> Compressed:
-    """Write the range images of a source into one file, each compressed by itself and read again before it is kept.
+    """Write the range images of a source into one file, each read again before it is kept.
+
+    Each is compressed by itself, or, by a model of drives, given those before it as the file has them.
 
     Args:
         out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
@@ -100,12 +103,11 @@ class _Work:
     rays: str = ""
 
 
-@dataclass(eq=False)
 class _Compressor:
-    codec: ScanCodec
-    inputs: Inputs
-    skips: bool
-    told: bool = False
+    def __init__(self, codec: ScanCodec, inputs: Inputs, skips: bool) -> None:
+        self.codec, self.inputs, self._skips, self._told = codec, inputs, skips, False
+        self._drives = DrivesOfSource(inputs.timed_scans(), codec.past_scans) if codec.past_scans else None
+        self._image = lru_cache(maxsize=2 * codec.past_scans + 1)(self._read)
 
     @classmethod
     def of(cls, work: _Work) -> "_Compressor":
@@ -116,20 +118,43 @@ class _Compressor:
 
     def write(self, folder: Path, indices: Sequence[int]) -> int:
         for index in indices:
-            data, returns = b"", 0
+            data, returns, image = b"", 0, self._image(index)
             try:
-                image = self.inputs.read(index).image
-                data, returns = self.codec.compress(image), int(image.return_mask.sum())
+                if isinstance(image, ScanError):
+                    raise image
+                data, returns = self._compress(index, image), int(image.return_mask.sum())
             except ScanError as error:
-                if not self.skips:
+                if not self._skips:
                     raise
                 reporting.message(f"left out: {error}")
             else:
-                if not self.told and (lost := _not_kept(image)):
-                    self.told = True
+                if not self._told and (lost := _not_kept(image)):
+                    self._told = True
                     reporting.message(f".lgz keeps no {lost}")
             add_scan(folder, index, (self.inputs.name(index), self.inputs.identity(index), returns), data)
         return len(indices)
+
+    def _read(self, index: int) -> RangeImage | ScanError:
+        """Return the image of a scan, or why it is left out."""
+        try:
+            return self.inputs.read(index).image
+        except ScanError as error:
+            if not self._skips:
+                raise
+            return error
+
+    def _compress(self, index: int, image: RangeImage) -> bytes:
+        drives = self._drives
+        if drives is None:
+            return self.codec.compress(image)
+        images = [(at, self._image(at)) for at in drives.before(index)]
+        there = [(at, self.codec.rounded(one)) for at, one in images if isinstance(one, RangeImage)]
+        place = drives.place(index, len(there))
+        before = [PlacedScan(drives.place(at, 0), one) for at, one in there]
+        try:
+            return place.to_bytes() + self.codec.compress(image, past_of(place, before))
+        except ScanError as error:  # it cannot be left out: later scans are compressed as if it were there
+            raise ConfigError(error.got, error.wanted, "name another --step-mm") from None
 
 
 _compressor_of = lru_cache(maxsize=1)(_Compressor.of)  # for all shares of a worker
@@ -158,6 +183,7 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
         raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
     codec = _codec_of(archive, model)
+    read = _Drives(archive, codec).read if codec.past_scans else lambda index: codec.decompress(archive.read(index))
     indices = list(dict.fromkeys(chosen)) or range(len(archive))
     names = [archive.names[index] for index in indices]
     facts = {"source": path.name, "index_crc32": archive.index_crc32}
@@ -165,7 +191,7 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
     folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], names)
     with folder.writing("decompressing") as progress:
         for number in folder.missing:
-            image, file = codec.decompress(archive.read(indices[number])), out / folder.files[number]
+            image, file = read(indices[number]), out / folder.files[number]
             folder.tell_sensor(codec.sensor)
             if form is None:
                 write_array(file, image.range_m)
@@ -173,6 +199,32 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Seque
                 form.write(file, unproject(image))
             progress.advance(1)
     return folder.num_written
+
+
+class _Drives:
+    """Decompresses scans that were compressed given those before them, of which the last ones are kept."""
+
+    def __init__(self, archive: Archive, codec: ScanCodec) -> None:
+        self._archive, self._codec, self._last = archive, codec, dict[int, PlacedScan]()
+
+    def read(self, index: int) -> RangeImage:
+        first = index
+        while first not in self._last and self._split(first)[0].before:
+            first -= 1
+        for number in range(first, index + 1):
+            if number not in self._last:
+                place, compressed = self._split(number)
+                before = [self._last[at] for at in range(number - place.before, number)]
+                image = self._codec.decompress(compressed, past_of(place, before))
+                self._last = {at: one for at, one in self._last.items() if number - self._codec.past_scans < at}
+                self._last[number] = PlacedScan(place, image)
+        return self._last[index].image
+
+    def _split(self, index: int) -> tuple[Place, bytes]:
+        place, compressed = Place.split(self._archive.read(index))
+        if place.before > min(index, self._codec.past_scans):
+            raise not_reproduced()
+        return place, compressed
 
 
 def _not_kept(image: RangeImage) -> str:

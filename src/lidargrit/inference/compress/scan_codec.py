@@ -1,4 +1,4 @@
-"""One range image ⇄ bytes, by a generator with a pixel decoder."""
+"""One range image ⇄ bytes, by a generator with a pixel decoder, and by the past of its drive if that takes one."""
 
 import copy
 import hashlib
@@ -20,7 +20,11 @@ from lidargrit.generation.tokens import TokenGenerator
 from lidargrit.inference.compress.coder import ONE, Coder, Decoder, Encoder, StepMixture, not_reproduced
 from lidargrit.inference.compress.rounding import MASK_LOGITS, Rounding, sigmoid
 from lidargrit.nn.precision import inference
+from lidargrit.scans.past import Past
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
+from lidargrit.scans.warp import warp
+from lidargrit.systems.forecaster.network import PastNetwork
+from lidargrit.systems.forecaster.system import Forecaster
 from lidargrit.systems.multiscale.system import Multiscale
 
 _HASH_BYTES = 8  # of the hash of the pixels, with which a scan begins
@@ -48,11 +52,12 @@ class ScanCodec:
     two phase by phase. Tokens are coded as equally likely: a transformer would make the file one hundredth smaller, and
     would take most of the time. Scans are computed on the CPU, one by one, whatever device the generator is on.
 
-
+    Attributes:
+        past_scans: number of scans of a past that probabilities depend on; 0 for a model that takes none.
     """
 
     def __init__(self, generator: Generator, step_mm: int) -> None:
-        tokenizer, pixels = _parts(generator)
+        tokenizer, pixels, past = _parts(generator)
         if pixels is None:
             raise ConfigError(
                 f"a model of {generator.public_name()!r} without a pixel decoder",
@@ -66,26 +71,36 @@ class ScanCodec:
         if self._tokenizer is not None:
             self._tokenizer.cpu().double().eval().requires_grad_(False)
         self._pixels = copy.deepcopy(pixels).cpu().double().eval().requires_grad_(False)
+        self._past = None if past is None else copy.deepcopy(past).cpu().double().eval().requires_grad_(False)
+        self.past_scans = 0 if past is None else past.scans
 
     def digest(self) -> str:
         """Return a hash of all that probabilities depend on: weights, their sizes, and the sensor."""
         found = hashlib.sha256(json.dumps(self.sensor.to_json(), sort_keys=True).encode())
-        for part in (self._tokenizer, self._pixels):
+        for part in (self._tokenizer, self._pixels, self._past):
             for name, weight in sorted(part.state_dict().items() if part is not None else ()):
                 found.update(f"{name} {tuple(weight.shape)}".encode())
                 found.update(weight.contiguous().numpy().astype("<f8").tobytes())
         return found.hexdigest()
 
+    def rounded(self, image: RangeImage) -> RangeImage:
+        """Return a range image (H, W) as it comes back: on the CPU, its ranges rounded to the step."""
+        return self.steps.round(RangeImage.stack([image]).to("cpu"))[0]
+
     @inference()
-    def compress(self, image: RangeImage) -> bytes:
-        """Return a range image (H, W) as bytes; rounding to the step moves ranges by half of it at most."""
+    def compress(self, image: RangeImage, past: Past | None = None) -> bytes:
+        """Return a range image (H, W) as bytes; rounding to the step moves ranges by half of it at most.
+
+        Args:
+            past: past of the scan, for a model that takes one; none if not given.
+        """
         if image.range_m.ndim != 2 or not image.sensor.same_rays(self.sensor):
             raise ConfigError(
                 f"a range image {tuple(image.range_m.shape)} of the sensor {image.sensor.name!r}",
                 f"one image ({self.sensor.height}, {self.sensor.width}) of {self.sensor.name!r}",
                 "project the scan with the sensor of the model",
             )
-        rounded = self.steps.round(RangeImage.stack([image]).to("cpu"))
+        rounded = RangeImage.stack([self.rounded(image)])
         tokens = None
         if self._encoder is not None:
             device = next(self._encoder.parameters()).device
@@ -93,27 +108,35 @@ class ScanCodec:
         pixels = self.steps.indices(rounded.range_m[0]).where(rounded.return_mask[0], 0).numpy()
         pixels = np.pad(pixels, ((0, self._pixels.grid.height - len(pixels)), (0, 0)))  # in absent rows nothing returns
         coder = Encoder()
-        self._code(coder, Known(tokens, pixels))
+        self._code(coder, past, Known(tokens, pixels))
         compressed = _hash(pixels) + coder.words()
-        self.decompress(compressed)  # so that nothing is written that this machine could not read
+        self.decompress(compressed, past)  # so that nothing is written that this machine could not read
         return compressed
 
     @inference()
-    def decompress(self, compressed: bytes) -> RangeImage:
-        """Return the range image (H, W) that :meth:`compress` was given, its ranges rounded to the step."""
+    def decompress(self, compressed: bytes, past: Past | None = None) -> RangeImage:
+        """Return the range image (H, W) that :meth:`compress` was given, its ranges rounded to the step.
+
+        Args:
+            past: the very past that it was given.
+        """
         if len(compressed) < _HASH_BYTES or (len(compressed) - _HASH_BYTES) % 4:
             raise not_reproduced()
-        pixels = self._code(Decoder(compressed[_HASH_BYTES:]), None)
+        pixels = self._code(Decoder(compressed[_HASH_BYTES:]), past, None)
         if _hash(pixels) != compressed[:_HASH_BYTES]:
             raise not_reproduced()
         found = torch.from_numpy(pixels)[: self.sensor.height]
         return RangeImage.masked(self.steps.range_m(found), found > 0, self.sensor)
 
-    def _code(self, coder: Coder, known: Known | None) -> Pixels:
+    def _code(self, coder: Coder, past: Past | None, known: Known | None) -> Pixels:
         """Code or decode a scan, in one order; the scan itself is given only to an encoder."""
-        guide = self._pixels.guide(self._code_tokens(coder, known), 1)
+        decoded = self._code_tokens(coder, known) if self._past is None else self._told(self._past, past)
+        guide = self._pixels.guide(decoded, 1)
         mask = self._code_mask(coder, guide, known)
         return self._code_ranges(coder, guide, mask, known)
+
+    def _told(self, network: PastNetwork, past: Past | None) -> Decoded:
+        return network.told(warp(past or Past.nothing(self.sensor, 1, 1)), self.sensor)
 
     def _code_tokens(self, coder: Coder, known: Known | None) -> Decoded | None:
         if self._tokenizer is None:
@@ -152,11 +175,15 @@ class ScanCodec:
         return pixels
 
 
-def _parts(generator: Generator) -> tuple[Tokenizer | None, PixelDecoder | None]:
-    """Return the tokenizer and the pixel decoder of a generator, which may lack either."""
+def _parts(generator: Generator) -> tuple[Tokenizer | None, PixelDecoder | None, PastNetwork | None]:
+    """Return the tokenizer, the pixel decoder, and the network over the past of a generator, which may lack some."""
+    if isinstance(generator, Forecaster):
+        return None, generator.pixels, generator.past
     if isinstance(generator, Multiscale):
-        return None, generator.pixels
-    return (generator.tokenizer, generator.pixels) if isinstance(generator, TokenGenerator) else (None, None)
+        return None, generator.pixels, None
+    return (
+        (generator.tokenizer, generator.pixels, None) if isinstance(generator, TokenGenerator) else (None, None, None)
+    )
 
 
 def _hash(pixels: Pixels) -> bytes:
