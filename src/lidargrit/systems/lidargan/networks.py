@@ -103,7 +103,7 @@ def relativistic_loss(of_own: Float[Tensor, "B"], of_other: Float[Tensor, "B"]) 
 
     Args:
         of_own: discriminator's outputs for the images that the player wants to look real.
-        of_other: its outputs for the other images.
+        of_other: outputs for the other images.
 
     Source:
         Jolicoeur-Martineau, The relativistic discriminator, 2019.
