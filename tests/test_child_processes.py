@@ -11,10 +11,6 @@ import pytest
 
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.processes import process_pool
-from lidargrit.data.drives import DriveConfig, write_drives
-from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.prepared.prepare import prepare
-from lidargrit.scans.sensors import load_sensor
 from lidargrit.viewer.serve.jobs import JobQueue
 from test_generator_contract import made
 
@@ -41,19 +37,6 @@ def test_serve_runs_nothing_from_the_current_folder(poisoned, tmp_path):
     (tmp_path / "results").mkdir()
     with JobQueue([tmp_path / "run"], tmp_path / "results") as queue:
         assert len(queue.models) == 1
-    assert traces(poisoned) == []
-
-
-def test_prepare_runs_nothing_from_the_current_folder(poisoned, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys.modules[prepare.__module__], "_SHARD_SCANS", 1)
-    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
-    prepare("simulated:2", DataConfig(workers=2), tmp_path / "prepared", sensor=sensor)
-    assert traces(poisoned) == []
-
-
-def test_simulate_runs_nothing_from_the_current_folder(poisoned, tmp_path):
-    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
-    write_drives(tmp_path / "drives", 2, DriveConfig(sensor), workers=2)
     assert traces(poisoned) == []
 
 

@@ -14,7 +14,7 @@ from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.classical_features import classical_features
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.systems.completion.system import Completion, CompletionConfig, CompletionObjective, random_patterns
 from lidargrit.systems.lidargrit.system import TokenSampling
@@ -50,19 +50,22 @@ def test_hints_tell_the_next_return_on_every_side():
     range_m = torch.zeros(1, 64, 32)
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     image = RangeImage(range_m, range_m > 0, SENSOR)
-    hints = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
-    above, below, left, right = hints.candidates[0, 3:7, 10, 6].expm1().tolist()
+    classical = classical_features(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
+    above, below, left, right = classical.candidates[0, 3:7, 10, 6].expm1().tolist()
     assert (below, left, right) == pytest.approx((11.0, 5.0, 8.0))
-    assert above == pytest.approx(float(hints.candidates[0, 0, 10, 6].expm1()))  # nothing above: as triangulated
-    assert hints.maps[0, 9:13, 10, 6].tolist() == pytest.approx([4.0, 10 / 16, 2 / 16, 24 / 16])
-    assert float(hints_of(Observed.nothing(SENSOR, 1)).maps.abs().max()) == 0
+    assert above == pytest.approx(float(classical.candidates[0, 0, 10, 6].expm1()))  # nothing above: as triangulated
+    assert classical.maps[0, 9:13, 10, 6].tolist() == pytest.approx([4.0, 10 / 16, 2 / 16, 24 / 16])
+    assert float(classical_features(Observed.nothing(SENSOR, 1)).maps.abs().max()) == 0
 
 
 def test_hints_of_the_mirror_image_are_those_of_mirrored_scans():
     images = scans(1)
     known = Observed.of_pixels(images, torch.rand(1, 64, 32, generator=torch.Generator().manual_seed(0)) < 0.2)
     there = RangeImage(known.range_m.flip(-1), known.return_mask.flip(-1), SENSOR)
-    mirrored, wanted = hints_of(known).mirrored(), hints_of(Observed.of_pixels(there, known.return_observed.flip(-1)))
+    mirrored, wanted = (
+        classical_features(known).mirrored(),
+        classical_features(Observed.of_pixels(there, known.return_observed.flip(-1))),
+    )
     exact = [
         0,
         1,
@@ -90,14 +93,14 @@ def test_it_begins_near_triangulation_and_a_scan_depends_on_its_seed_alone():
 def test_the_likelihood_of_the_mask_counts_unknown_pixels_alone():
     network, images = made(), scans(2)
     known = rows_of(images)
-    point = network(hints_of(known), known.return_observed)
+    point = network(classical_features(known), known.return_observed)
     nats = network.mask.nats(point.guide, images.return_mask, None)
     assert nats.shape == (2,)
     rng = torch.Generator().manual_seed(0)
     estimates = torch.stack([network.mask.nats(point.guide, images.return_mask, rng) for _ in range(40)])
     assert torch.allclose(estimates.mean(0), nats, rtol=0.1)
     whole = Observed.of_pixels(images, torch.ones_like(images.return_mask))
-    point = network(hints_of(whole), whole.return_observed)
+    point = network(classical_features(whole), whole.return_observed)
     assert network.mask.nats(point.guide, images.return_mask, None).tolist() == [0, 0]
 
 

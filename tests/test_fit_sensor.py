@@ -385,7 +385,7 @@ def test_points_that_lie_half_a_column_off_keep_a_pixel_each_or_are_told(name, c
     told = any(f"share a pixel (--set data.columns={columns} keeps them apart)" in note for note in fit.warnings)
     hidden, with_own_columns = (
         1 - int(project(scans[0], seen).return_mask.sum()) / len(scans[0])
-        for seen in (fit.sensor, DataConfig(columns=columns).imaged(fit.sensor))
+        for seen in (fit.sensor, DataConfig(columns=columns).with_projection(fit.sensor))
     )
     assert (hidden <= 0.01) != told
     assert with_own_columns <= 0.01

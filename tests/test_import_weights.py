@@ -11,7 +11,9 @@ import torch
 
 import lidargrit
 from lidargrit.cli import main
+from lidargrit.core.discovery import names
 from lidargrit.core.files import claim_folder
+from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
 from lidargrit.systems.lidargrit.system import LidarGrit
 from reference_weights import seeded_weights
@@ -32,6 +34,8 @@ SMALL = [  # the sizes of the reference numbers' two networks, whose tokens fit 
     "model.transformer.width=32",
 ]
 PRESET = "lidargrit_kitti_odometry"
+PUBLISHED = {name: f"{name}_kitti_360" for name in ("lidargen", "lidm", "r2dm", "r2flow", "ultralidar")}
+PUBLISHED |= {name: f"{name}_kitti_odometry" for name in ("dusty", "lidargan", "lidargrit", "lidarvae")}
 
 
 @functools.cache
@@ -86,7 +90,8 @@ def test_imported_networks_give_the_programs_numbers(golden, tmp_path):
         assert np.allclose(model.transformer(tokens[:, :-1]).numpy(), gpt["logits"], atol=1e-4)
 
 
-def test_an_import_is_a_run_that_all_verbs_take(files, tmp_path, capsys):
+def test_an_import_is_a_run_that_verbs_take(files, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(LidarGrit, "own_batches", (2, 2))  # as many as are wanted
     run, samples = str(tmp_path / "run"), str(tmp_path / "samples")
     assert imported(run, files) == 0
     assert "weights of lidargrit for hdl64e_kitti_odometry lie in" in capsys.readouterr().out
@@ -97,7 +102,6 @@ def test_an_import_is_a_run_that_all_verbs_take(files, tmp_path, capsys):
     assert json.loads((tmp_path / "samples" / "samples.json").read_text())["projection_variant"] == "reference"
     assert main(["evaluate", samples, "simulated:2:test", "--metrics", "sliced_wasserstein", "--intervals", "0"]) == 0
     assert main(["likelihood", "simulated:2:test", "--model", run]) == 0
-    assert main(["view", run, "-o", str(tmp_path / "run.png"), "-n", "1"]) == 0
 
 
 def test_the_same_import_again_changes_nothing_and_no_training_goes_on_there(files, tmp_path, capsys):
@@ -185,20 +189,31 @@ def test_files_in_another_order_or_number_or_of_another_system_are_refused(files
     assert not out.exists()
 
 
-def test_code_in_a_file_is_never_run(files, tmp_path, capsys):
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_code_in_a_file_is_never_run_and_cut_files_write_nothing(name, tmp_path, capsys):
     class Bomb:
         def __reduce__(self):
             return (open, (str(tmp_path / "ran"), "w"))
 
-    for name, write in (
-        ("zip.pth", lambda path: torch.save({"VQ": Bomb()}, path)),
-        ("old.pth", lambda path: torch.save({"VQ": Bomb()}, path, _use_new_zipfile_serialization=False)),
-        ("plain.pth", lambda path: path.write_bytes(pickle.dumps({"VQ": Bomb()}))),
+    path, out, files = tmp_path / "x.pth", tmp_path / "run", len(load_class(name).published_files)
+    for write in (
+        lambda: torch.save({"VQ": Bomb()}, path),
+        lambda: torch.save([Bomb()], path, _use_new_zipfile_serialization=False),
+        lambda: path.write_bytes(pickle.dumps({"VQ": Bomb()})),
     ):
-        write(tmp_path / name)
-        assert imported(tmp_path / "run", [str(tmp_path / name), files[1]]) == 2
+        write()
+        assert main(["import-weights", PUBLISHED[name], str(out), *[str(path)] * files]) == 2
         assert "which does not hold tensors only" in the_one_line(capsys.readouterr().err, "import-weights")
+    torch.save({"VQ": torch.ones(3000)}, path)
+    path.write_bytes(path.read_bytes()[:-2000])
+    assert main(["import-weights", PUBLISHED[name], str(out), *[str(path)] * files]) == 2
+    assert "x.pth, which is no whole file" in the_one_line(capsys.readouterr().err, "import-weights")
     assert not (tmp_path / "ran").exists()
+    assert not out.exists()
+
+
+def test_every_system_with_published_weights_is_here():
+    assert PUBLISHED.keys() == {name for name in names("generators") if load_class(name).published_files}
 
 
 def test_r2dm_and_dusty_import_with_sizes_of_their_own(tmp_path):

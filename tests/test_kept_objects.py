@@ -35,8 +35,7 @@ def same(one, two):
     assert (np.abs(one.cos_incidence - two.cos_incidence)[alike] > 1e-3).sum() <= 8  # nor is it at edges within a part
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 5, 12])
-@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize(("seed", "moves"), [(1, False), (12, False), (5, True)])
 def test_hits_are_those_of_one_mesh(seed, moves):
     scene = scene_of(seed)
     poses = [scene.sensor_pose(time_s) for time_s in ((0.4, 0.4 + REVOLUTION_S) if moves else (0.4,))]

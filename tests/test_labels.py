@@ -23,7 +23,7 @@ from lidargrit.scans.fills import fill, fill_lacking
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.classical_features import classical_features
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.systems.completion.system import CompletionObjective
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
@@ -103,7 +103,7 @@ def test_hints_tell_the_class_of_the_next_return_on_every_side():
     label = torch.zeros(1, 64, 32, dtype=torch.int64)
     label[0, 10, 4], label[0, 10, 30], label[0, 20, 6] = 40, 50, 70
     image = RangeImage(range_m, range_m > 0, SENSOR, {"label": label})
-    found = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
+    found = classical_features(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.labels is not None
     assert found.labels[0, :, 10, 6].tolist() == [70, 70, 70, 40, 50]  # nothing above: as the nearest, that below
     mirrored = found.mirrored().labels

@@ -122,7 +122,7 @@ def test_after_any_change_of_weights_it_samples_as_a_fresh_one_does(precision):
         for weight in generator.parameters():
             weight.data.mul_(-3)  # which changes neither the address nor the version
     fresh = copy.deepcopy(generator)
-    fresh._prepared = None
+    fresh._decoder_cache = None
     assert torch.equal(generator.sample([0], sampling=sampling).range_m, fresh.sample([0], sampling=sampling).range_m)
 
 
@@ -191,24 +191,24 @@ def test_the_bits_are_those_of_tokens_mask_and_ranges():
     assert float(generator.bits(images, 1).per_scan()["range"].sum()) == pytest.approx(expected, rel=2e-3)
 
 
-def test_surprise_is_what_exceeds_the_expected_bits(tmp_path, capsys):
+def test_anomaly_is_what_exceeds_the_expected_bits(tmp_path, capsys):
     generator, images = made(), scans(2)
     bits = generator.bits(images, expected=True)
     assert bits.mask is not None
     assert bits.range is not None
     assert bits.expected is not None
-    assert torch.allclose(bits.surprise(), bits.mask + bits.range - bits.expected)
+    assert torch.allclose(bits.anomaly(), bits.mask + bits.range - bits.expected)
     dropped = ~images.return_mask
     assert bool((bits.expected[dropped] <= 1.0001).all())  # of a mask alone, at most one bit
     for lacking in (generator.bits(images), made(None).bits(images, expected=True)):
         with pytest.raises(ConfigError, match="got bits without those that were expected"):
-            lacking.surprise()
+            lacking.anomaly()
     generator.save(tmp_path / "run")
-    words = ["view", "simulated:1:test", "--color", "surprise", "--model", str(tmp_path / "run"), "-n", "1"]
-    assert main([*words, "-o", str(tmp_path / "surprise.png")]) == 0
-    assert (tmp_path / "surprise.png").stat().st_size > 10_000
-    assert main([*words, "-o", str(tmp_path / "surprise.html")]) == 0
-    assert '"surprise": "' in (tmp_path / "surprise.html").read_text()
+    words = ["view", "simulated:1:test", "--color", "anomaly", "--model", str(tmp_path / "run"), "-n", "1"]
+    assert main([*words, "-o", str(tmp_path / "anomaly.png")]) == 0
+    assert (tmp_path / "anomaly.png").stat().st_size > 10_000
+    assert main([*words, "-o", str(tmp_path / "anomaly.html")]) == 0
+    assert '"anomaly": "' in (tmp_path / "anomaly.html").read_text()
 
 
 def test_maskgit_counts_every_token_alike():

@@ -39,9 +39,9 @@ STEADY = [  # no random numbers of a process, only of a scan; codes that restart
     *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "residual")],
     "training.tokenizer.augmentations=[flip,roll]",
     *[f"training.{stage}.precision=fp32" for stage in ("tokenizer", "transformer")],
-    "training.tokenizer.scans=48",
+    "training.tokenizer.scans=24",
     "training.tokenizer.validate_every=4",
-    "training.transformer.scans=64",
+    "training.transformer.scans=32",
     "training.transformer.validate_every=8",
 ]
 RANK = """
@@ -212,7 +212,7 @@ def test_two_processes_learn_what_one_does(tmp_path):
     for stage, names in (("tokenizer", ("loss", "codebook_perplexity")), ("transformer", ("loss", "unigram_nll"))):
         for name in names:
             one, two = (losses(tmp_path / folder, stage, name) for folder in ("one", "two"))
-            assert len(one) >= 8
+            assert len(one) >= 4
             assert two == pytest.approx(one, rel=2e-3), (stage, name)
     one, two = (read_tensors(tmp_path / name / "tokenizer" / "checkpoint.safetensors")[0] for name in ("one", "two"))
     assert torch.allclose(one["objective.quantize.usage"], two["objective.quantize.usage"], rtol=0.02, atol=0.5)

@@ -19,6 +19,7 @@ from lidargrit.scans.types import RangeImage
 from lidargrit.systems.r2dm.system import DiffusionSampling, R2dm, R2dmConfig
 from lidargrit.systems.r2dm.unet import EfficientUnet, UnetConfig
 from reference_unet import SlowUnet
+from tiny_runs import learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 TINY = UnetConfig(8, (1, 2), (1, 1), norm_groups=2, attention_heads=2)
@@ -348,15 +349,8 @@ def test_an_image_is_learned_by_heart():
     images = RangeImage(high.range_m[:, ::4], high.return_mask[:, ::4], sensor)
     generator = made(sensor, reflectance=False)
     objective = generator.objective("diffusion").train()
-    optimiser = torch.optim.Adam(objective.parameters(), lr=5e-3)
-    losses = []
     batch = RangeImage.stack([images[0]] * 2)
-    for step in range(100):
-        loss = objective(Example(batch), torch.Generator().manual_seed(step))["loss"]
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
+    losses = [terms["loss"] for terms in learn(objective, batch, range(100), 5e-3)]
     assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
     drawn = generator.sample([0], sampling=DiffusionSampling(steps=12))
     unlearned = made(sensor, reflectance=False).sample([0], sampling=DiffusionSampling(steps=12))

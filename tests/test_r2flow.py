@@ -21,7 +21,7 @@ from lidargrit.systems.r2flow.system import FlowSampling, R2flow, R2flowConfig
 from lidargrit.training import compute
 from lidargrit.training.taken_stages import taken_stages
 from test_hdit import reference_network
-from tiny_runs import the_one_line
+from tiny_runs import learn, the_one_line
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
 TINY = HditConfig(16, 16, (1, 1), (1, 2))
@@ -145,16 +145,8 @@ def test_later_trainings_straighten_and_distil_the_flow():
     assert generator.stages == ("flow", "reflow", "distillation")
     for stage in generator.stages[1:]:
         objective = generator.objective(stage).train()
-        optimiser = torch.optim.Adam(objective.parameters(), lr=3e-3)
-        found = []
-        for step in range(24):
-            loss = objective(Example(images), torch.Generator().manual_seed(step % 2))[
-                "loss"
-            ]  # the same pairs and times
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            found.append(float(loss.detach()))
+        seeds = [step % 2 for step in range(24)]  # the same pairs and times
+        found = [terms["loss"] for terms in learn(objective, images, seeds, 3e-3)]
         assert sum(found[-2:]) < 0.8 * sum(found[:2]), stage
         kept = objective._pairs._kept
         assert set(kept) <= set(range(4)), "a pair is made once, and none is for validation"
@@ -337,14 +329,8 @@ def test_an_image_is_learned_by_heart():
     generator, images = made(reflectance=False), walls(1, reflectance=False)
     before = generator.sample([0], sampling=FlowSampling(steps=8))
     objective = generator.objective("flow").train()
-    optimiser = torch.optim.Adam(objective.parameters(), lr=5e-3)
-    losses, batch = [], RangeImage.stack([images[0]] * 4)
-    for step in range(80):
-        loss = objective(Example(batch), torch.Generator().manual_seed(step))["loss"]
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
+    batch = RangeImage.stack([images[0]] * 4)
+    losses = [terms["loss"] for terms in learn(objective, batch, range(80), 5e-3)]
     assert sum(losses[-20:]) < 0.7 * sum(losses[:20])
     generator.load_stage("flow", objective)
     found = generator.sample([0], sampling=FlowSampling(steps=8))

@@ -173,4 +173,4 @@ def test_the_expected_bits_are_the_mean_over_all_steps():
     nats = -RangeMixture(logits, centres, scales, limits_m).log_mass(*steps.edges_m(every))
     error = mixture.entropy(steps).double() - (nats.exp().reciprocal() * nats).sum(-1)
     assert float(error.abs().max()) < 0.1
-    assert abs(float(error.mean())) < 0.006, "the surprise of a scan is a sum over its pixels"
+    assert abs(float(error.mean())) < 0.006, "the anomaly of a scan is a sum over its pixels"

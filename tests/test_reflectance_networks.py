@@ -22,7 +22,7 @@ from lidargrit.scans.marks import mark, read_marks
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
-from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.classical_features import classical_features
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.systems.completion.system import Completion, CompletionConfig, CompletionObjective, random_patterns
 from lidargrit.systems.lidargrit.system import TokenSampling
@@ -113,13 +113,13 @@ def test_hints_tell_the_reflectance_of_the_next_return_on_every_side():
     range_m[0, 10, 4], range_m[0, 10, 30], range_m[0, 20, 6] = 5.0, 8.0, 11.0
     bright[0, 10, 4], bright[0, 10, 30], bright[0, 20, 6] = 0.2, 0.4, 0.8
     image = RangeImage(range_m, range_m > 0, SENSOR, {"reflectance": bright})
-    found = hints_of(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
+    found = classical_features(Observed.of_pixels(image, torch.ones_like(image.return_mask)))
     assert found.reflectances is not None
     assert found.reflectances[0, 1:, 10, 6].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.2, 0.4])
     mirrored = found.mirrored().reflectances
     assert mirrored is not None
     assert mirrored[0, 1:, 10, 25].tolist() == pytest.approx([0.8, 0.8, 0.8, 0.4, 0.2])
-    assert hints_of(Observed.nothing(SENSOR, 1)).reflectances is None
+    assert classical_features(Observed.nothing(SENSOR, 1)).reflectances is None
 
 
 @torch.no_grad()
@@ -132,7 +132,7 @@ def test_the_loss_counts_hidden_returns_alone():
     known = Observed.of_pixels(images, observed)
     assert known.reflectance is not None
     known = replace(known, planes={"reflectance": hidden_in_some(known.reflectance, TYPICAL_REFLECTANCE, 0.25, rng)})
-    found = network(hints_of(known), observed).reflectance
+    found = network(classical_features(known), observed).reflectance
     assert found is not None
     true, errors = reflectance_of(images), []
     for scan in range(2):
@@ -150,7 +150,7 @@ def test_it_learns_reflectance_and_begins_near_triangulation():
     known = every_fourth_row(images)
     both = ~known.return_observed & images.return_mask
     with torch.no_grad():
-        begun = network(hints_of(known), known.return_observed).reflectance
+        begun = network(classical_features(known), known.return_observed).reflectance
     assert begun is not None
     triangulated = fill("triangulation", known)
     both &= triangulated.return_mask

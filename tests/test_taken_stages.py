@@ -9,7 +9,7 @@ from lidargrit.core.configuration import changed, override
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.generator import load_class
+from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.systems.lidargrit.system import TokenSampling
@@ -96,11 +96,14 @@ def test_stages_are_taken_from_several_runs_unless_one_rests_on_another(tmp_path
         taken_stages(over, over.build_generator())
 
 
-def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path):
+def test_settings_of_a_stage_that_is_not_trained_are_not_looked_at(tmp_path, monkeypatch):
     made(None).save(tmp_path / "donor")
+    loaded = []
+    monkeypatch.setattr("lidargrit.training.taken_stages.load", lambda run: loaded.append(run) or load(run))
     preset = changed(preset_of(PIXELS), {"training.pixels.batch_size": 6})  # 3 processes cannot share a batch of 2
     preset = starting(preset, tmp_path / "donor", ("tokenizer", "transformer"))
     checked = check_stages(preset, processes=3)
+    assert len(loaded) == 1, "a run of two stages is read once"
     assert checked.frozen == dict.fromkeys(("tokenizer", "transformer"), str(tmp_path / "donor"))
     assert list(checked.objectives) == ["tokenizer", "transformer", "pixels"]
     assert [stage.scans for stage in plan_training(preset).stages] == [0, 0, 4]

@@ -214,14 +214,14 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(tmp_path, images):
 def test_one_real_scan_is_learned_by_heart(tmp_path, real):
     """Within 20 seconds: range error under 0.3 m, mask accuracy over 0.95."""
     train = (f"kitti_raw:{real}/kitti_raw:2011_09_26_drive_9005_sync[:4%]",)
-    config = DataConfig(train=train, val=(), columns=2048, column_stride=64)  # 32 are quick
+    config = DataConfig(train=train, val=(), columns=2048, column_stride=128)  # 16 are quick
     scan = load_range_images(config.train, config)
     assert len(scan) == 1
     preset = load_preset("lidargrit_small")
     torch.manual_seed(0)
     vqvae = Vqvae(replace(preset.model.tokenizer, raydrop_weight=0.3), scan.sensor)
     learn = TrainingConfig(
-        scans=180, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=30, precision="auto",
+        scans=150, batch_size=1, learning_rate=2e-3, schedule="cosine", warmup_scans=30, precision="auto",
         average_over_scans=20, validate_every=1000, checkpoint_every=1000,
     )  # fmt: skip
     fit = StageTraining(vqvae, learn, tmp_path, 0).begun()
@@ -290,15 +290,14 @@ def test_a_folder_is_trained_in_by_one_process_at_a_time(tmp_path):
 
 def test_pictures_change_nothing(tmp_path, whole, monkeypatch):
     monkeypatch.setattr("lidargrit.viewer._matplotlib._DOTS_PER_INCH", 20)
-    every = [f"training.{stage}.pictures_every=6" for stage in ("tokenizer", "transformer")]
+    every = [f"training.{stage}.pictures_every=12" for stage in ("tokenizer", "transformer")]
     train(load_preset("lidargrit_demo", TINY + every), tmp_path / "drawn", plot=plot_progress)
     plain, drawn = (
         (folder / "model.safetensors").read_bytes() for folder in (whole("lidargrit_demo"), tmp_path / "drawn")
     )
     assert plain == drawn
     pictures = {str(path.relative_to(tmp_path / "drawn")): path for path in (tmp_path / "drawn").rglob("*.png")}
-    scans = ("000000006", "000000012")
-    assert pictures.keys() == {f"{s}/pictures/{n}.png" for s in ("tokenizer", "transformer") for n in scans}
+    assert pictures.keys() == {f"{stage}/pictures/000000012.png" for stage in ("tokenizer", "transformer")}
     heights = {name: int.from_bytes(path.read_bytes()[20:24], "big") for name, path in pictures.items()}  # of a PNG
     assert heights["transformer/pictures/000000012.png"] > heights["tokenizer/pictures/000000012.png"]
 

@@ -139,7 +139,7 @@ def test_runs_compute_on_the_device_that_is_named(tmp_path):
     with pytest.raises(ConfigError, match="device 'cuda:99'"):
         load_scan_sets(["pretrained"], 1, device="cuda:99")
     with pytest.raises(ConfigError, match="device 'cuda:99'"):
-        view(["simulated:1"], tmp_path / "a.png", surprise_by="pretrained", device="cuda:99")
+        view(["simulated:1"], tmp_path / "a.png", anomaly_by="pretrained", device="cuda:99")
     assert main(["view", "pretrained", "-o", str(tmp_path / "a.png"), "--device", "cuda:99"]) == 2
     assert not list(tmp_path.iterdir())
 
@@ -189,7 +189,7 @@ def test_sets_of_one_name_are_told_apart_and_runs_of_other_rays_reconstruct_noth
     ("words", "message"),
     [
         (["-o", "a.svg"], "got a.svg, which will hold PNG or HTML; wanted a name in .png or .html"),
-        (["-o", "a.png", "--model", "nosuch"], "got --model nosuch with --color range; wanted --color surprise"),
+        (["-o", "a.png", "--model", "nosuch"], "got --model nosuch with --color range; wanted --color anomaly"),
     ],
 )
 def test_words_that_the_command_would_not_follow_are_refused(words, message, tmp_path, monkeypatch, capsys):

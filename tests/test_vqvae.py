@@ -223,12 +223,12 @@ def test_threshold_and_bernoulli_masks():
         tokens = vqvae.encode(images_of(sensor))
         probability = vqvae.decode(tokens).return_logits.sigmoid()
         rngs = [torch.Generator().manual_seed(seed) for seed in (0, 1)]
-        sampled = torch.stack([vqvae.sample(tokens, rngs).return_mask for _ in range(300)]).float().mean(0)
+        sampled = torch.stack([vqvae.sample(tokens, rngs).return_mask for _ in range(120)]).float().mean(0)
         alone = vqvae.sample(TokenGrid(tokens.tokens[1:], 16), [torch.Generator().manual_seed(1)])
         beside = vqvae.sample(tokens, [torch.Generator().manual_seed(seed) for seed in (0, 1)])
         threshold = vqvae.sample(tokens, rngs, "threshold")
     assert torch.equal(threshold.return_mask, probability >= 0.5)
-    assert float((sampled - probability).abs().max()) < 0.2  # five standard errors of 300 samples are 0.14
+    assert float((sampled - probability).abs().max()) < 0.25  # five standard errors of 120 samples are 0.23
     assert float((sampled - probability).mean()) == pytest.approx(0, abs=0.01)
     assert float((alone.return_mask == beside.return_mask[1:]).float().mean()) > 0.999  # its own random numbers
 

@@ -32,11 +32,11 @@ MODEL = [  # 64x64 range images, 8x8 tokens
 ]
 SIMULATED = ["data.train=[simulated:4:train]", "data.val=[simulated:1:val]"]
 SHORT = ["training.tokenizer.scans=4", "training.transformer.scans=8"]
-LONG = [  # 12 and 6 steps on 64x32 images, a checkpoint after each
+LONG = [  # 6 and 4 steps on 64x32 images, a checkpoint after each
     "data.column_stride=16",
-    "training.tokenizer.scans=48",
+    "training.tokenizer.scans=24",
     "training.tokenizer.checkpoint_every=4",
-    "training.transformer.scans=48",
+    "training.transformer.scans=32",
     "training.transformer.checkpoint_every=8",
 ]
 PROGRESS = re.compile(

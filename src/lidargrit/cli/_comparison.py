@@ -118,7 +118,7 @@ def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     settings = scan_settings(options, max_scans=32 if options.count is None else options.count)
     named = settings.sensor or settings.data.columns or all(is_classical(word) for word in words)
     source = open_source(scans, settings.data.bad_points)
-    sensor = settings.data.imaged(sensor_for(source, settings.sensor)) if named else None
+    sensor = settings.data.with_projection(sensor_for(source, settings.sensor)) if named else None
     models = open_models(words, sensor, options.device)
     images = images_for(models, scans, settings)
     scores = compare_completion(images, models, patterns, options.samples, options.seed)

@@ -67,7 +67,7 @@ def named_sensor(options: argparse.Namespace, is_needed: bool, job: "Job" = "com
     if not is_needed:
         return sensor_for_run(settings, options.scans, options.model, job)
     source = open_source(options.scans, settings.data.bad_points)
-    return settings.data.imaged(sensor_for(source, settings.sensor))
+    return settings.data.with_projection(sensor_for(source, settings.sensor))
 
 
 def run_task(options: argparse.Namespace, model: "Model", task: "Task", probability: int = 0) -> None:

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.scans.sensors import load_sensor
 
     config = scan_settings(options, max_scans=options.count).data
-    sensor = config.imaged(load_sensor(options.sensor)) if options.sensor else None
+    sensor = config.with_projection(load_sensor(options.sensor)) if options.sensor else None
     change = UndoMotion(read_trajectory(options.undo_motion)) if options.undo_motion else None
     count = export_scans(options.scans, options.out, options.format, config, sensor, change)
     what = f"{count} {'recording' if count == 1 else 'recordings'}" if options.format in KINDS else counted_scans(count)

@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
     settings = scan_settings(options)
     scan, of_data_set = first_scan(options.scans, settings.data)
     name = settings.sensor or of_data_set or closest_sensor(scan)
-    sensor, method = settings.data.imaged(load_sensor(name)), None
+    sensor, method = settings.data.with_projection(load_sensor(name)), None
     if settings.data.projection == "sensor" and (method := projection_that_fits(scan, sensor)) != sensor.projection:
         reporting.message("points that are not in firing order, so rows go by elevation")
     found = inspect(scan, sensor, method, settings.data.projection_variant)

@@ -10,7 +10,7 @@ EXAMPLES = """\
   lidargrit view /data/scans                           range image, return mask and bird's-eye view
   lidargrit view /data/held_out runs/demo -o all.png   real, reconstructed and generated
   lidargrit view samples /data/held_out -o all.html -n 12       a page to turn, zoom and step through
-  lidargrit view /data/scans --color surprise          pixels that a model did not expect
+  lidargrit view /data/scans --color anomaly           pixels that a model did not expect
 """
 
 
@@ -21,9 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-o", "--out", type=Path, default=Path("view.png"), help=out)
     add_count(parser, 3, help="number of scans of each")
     add("--seed", type=seed_number, default=0, help="seed of the first generated scan")
-    colour = "colour of pixels: range, or surprise for the bits beyond those expected"
-    add("--color", choices=["range", "surprise"], default="range", help=colour)
-    model = "run whose likelihood gives the surprise; needs a pixel decoder (default: pretrained)"
+    colour = "colour of pixels: range, or anomaly for the bits beyond those expected"
+    add("--color", choices=["range", "anomaly"], default="range", help=colour)
+    model = "run whose likelihood gives the anomaly; needs a pixel decoder (default: pretrained)"
     add("--model", default="", help=model)
     add_scans(parser)
     add_device(parser)
@@ -35,11 +35,11 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.viewer import view
 
-    if options.model and options.color != "surprise":
+    if options.model and options.color != "anomaly":
         raise ConfigError(
-            f"--model {options.model} with --color range", "--color surprise", "add it, or leave --model out"
+            f"--model {options.model} with --color range", "--color anomaly", "add it, or leave --model out"
         )
     refuse_to_overwrite(options.out, options.overwrite, ".png", ".html")
     named = (options.scans, options.out, options.count, options.seed, scan_settings(options))
-    view(*named, (options.model or "pretrained") if options.color == "surprise" else "", options.device)
+    view(*named, (options.model or "pretrained") if options.color == "anomaly" else "", options.device)
     print(f"done: look at {options.out}")

@@ -107,11 +107,11 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: i
         )
     check_processes(processes)
     # Wrong words and runs of other presets are refused before anything is trained.
-    plans = [_Plan.of(system, folder, benchmark) for system in systems]
+    plans = [_SystemJob.of(system, folder, benchmark) for system in systems]
     reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
     if (benchmark.preset_settings or benchmark.flops) and not any(plan.preset for plan in plans):
         raise ConfigError("settings or a budget, and no preset", "a preset that they are for", "leave them out")
-    by_run: dict[Path, list[_Plan]] = {}  # systems of one run one after the other: it is trained once
+    by_run: dict[Path, list[_SystemJob]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
     _require_a_metric(benchmark.evaluation())
@@ -151,7 +151,7 @@ def _require_a_metric(settings: EvalConfig) -> None:
     raise errors[0]
 
 
-def _check_reference(reference: Source, plans: "Sequence[_Plan]", benchmark: Benchmark) -> None:
+def _check_reference(reference: Source, plans: "Sequence[_SystemJob]", benchmark: Benchmark) -> None:
     """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
     config = benchmark.evaluation().data_config()
     sensors = [plan.sensor for plan in plans if plan.sensor is not None]
@@ -161,7 +161,7 @@ def _check_reference(reference: Source, plans: "Sequence[_Plan]", benchmark: Ben
         images.batch([0])  # the size of a file is known once it is read
 
 
-def _warn_of_bounds(plans: "Sequence[_Plan]", reference: Source) -> None:
+def _warn_of_bounds(plans: "Sequence[_SystemJob]", reference: Source) -> None:
     """Warn of rows that bound the scores of another data set than the reference's: theirs has to be trained on."""
     unclear = {"", "folder", data_set_of(reference.text)[0] or reference.data_set}  # a folder's may be any data set
     presets = {plan.system: plan.preset for plan in plans if plan.preset is not None}
@@ -180,13 +180,13 @@ def _warn_of_bounds(plans: "Sequence[_Plan]", reference: Source) -> None:
 
 
 def _finish_as_process(
-    reporter: reporting.Reporter, plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark
+    reporter: reporting.Reporter, plans: "Sequence[_SystemJob]", folder: Path, benchmark: Benchmark
 ) -> int:
     with reporting.to(reporter):
         return _finish(plans, folder, benchmark)
 
 
-def _finish(plans: "Sequence[_Plan]", folder: Path, benchmark: Benchmark, reference: Source | None = None) -> int:
+def _finish(plans: "Sequence[_SystemJob]", folder: Path, benchmark: Benchmark, reference: Source | None = None) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
     settings = benchmark.evaluation()
@@ -299,7 +299,7 @@ def as_json(scores: Sequence[Path]) -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True)
-class _Plan:
+class _SystemJob:
     """How one system is made: from a finished run, or by training a preset; or its samples, which are there.
 
     Args:
@@ -317,7 +317,7 @@ class _Plan:
     card: Scorecard | None = None
 
     @classmethod
-    def of(cls, system: str, folder: Path, benchmark: Benchmark) -> "_Plan":
+    def of(cls, system: str, folder: Path, benchmark: Benchmark) -> "_SystemJob":
         if system.endswith(_SCORES):
             path, taken = Path(system), folder / _folder_name(system) / f"{_folder_name(system)}{_SCORES}"
             there = taken if taken.is_file() and not path.is_file() else path

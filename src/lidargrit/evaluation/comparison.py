@@ -239,7 +239,7 @@ def _sensor(scans: Source, settings: EvalConfig) -> SensorModel | None:
     sensor = load_sensor(settings.sensor) if settings.sensor else load_protocol(settings.protocol).load_sensor()
     if sensor is None and (settings.data.columns or settings.data.projection != "sensor"):
         sensor = scans.sensor  # named for prepared scans and .npy, which else keep their own columns and projection
-    return sensor and config.imaged(sensor)
+    return sensor and config.with_projection(sensor)
 
 
 def save_reference(scans: str, path: Path, settings: EvalConfig) -> ReferenceFile:

@@ -198,7 +198,7 @@ class StreetScans:
     @property
     def rays(self) -> SensorModel:
         """Sensor whose rays the images have."""
-        return self.config.imaged(self.firing)
+        return self.config.with_projection(self.firing)
 
     def real(self) -> RangeImages:
         """Return the real scans, at least two."""

@@ -250,7 +250,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         Args:
             images: batch of range images (B, H, W).
             step_mm: step in whole millimetres that ranges are rounded to, as a real number has infinitely many bits.
-            expected: whether the expected number of bits (the entropy) is computed, too, for :meth:`ScanBits.surprise`.
+            expected: whether the expected number of bits (the entropy) is computed, too, for :meth:`ScanBits.anomaly`.
             condition: condition of each scan, such as its past, for a generator whose likelihood depends on it.
 
         Raises:

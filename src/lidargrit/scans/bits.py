@@ -66,7 +66,7 @@ class ScanBits:
             bits = bits if part is None else bits + part
         return bits
 
-    def surprise(self) -> Float[Tensor, "B H W"]:
+    def anomaly(self) -> Float[Tensor, "B H W"]:
         """Return by how many bits each pixel's mask and range exceed their expected bits; 0 on average for usual scans.
 
         Raises:

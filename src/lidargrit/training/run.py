@@ -200,11 +200,11 @@ def _claim(folder: Path, preset: Preset, train_images: RangeImages, val_images: 
     _write_trained_on(folder, train_images, preset.start_runs.values())
 
 
-def _write_trained_on(folder: Path, train_images: RangeImages, donors: Iterable[str]) -> None:
+def _write_trained_on(folder: Path, train_images: RangeImages, runs: Iterable[str]) -> None:
     """Write what the model learns from: the training scans, and those of the stages that it takes."""
     if (folder / TRAINED_ON_FILE).exists():
         return
-    learned = [train_images.provenance, *(trained_on(locate(donor)) for donor in sorted({*donors}))]
+    learned = [train_images.provenance, *(trained_on(locate(run)) for run in sorted({*runs}))]
     write_trained_on(folder, Provenance.joined(learned))
 
 

@@ -50,21 +50,21 @@ def taken_stages(preset: Preset, generator: Generator) -> dict[str, Objective]:
     another sensor if its weights fit. A run may be of another generator if the stage learns by the same objective.
     """
     runs = {stage: run for stage, run in preset.start_runs.items() if stage in generator.stages}
-    donors, found = {run: load(Path(run)) for run in sorted({*runs.values()})}, {}
+    loaded, found = {run: load(Path(run)) for run in sorted({*runs.values()})}, {}
     for name, run in runs.items():
-        donor, config, ours = donors[run], preset.training[name], _Stage(name, generator)
+        other, config, ours = loaded[run], preset.training[name], _Stage(name, generator)
         setting = f"training.{name}.start={config.start}"
         # Of a tokenizer :func:`_check` tells the kind.
         kinds = (type(ours.objective), *(() if config.frozen else ours.objective.kin))
-        alike = name in donor.stages and (name == "tokenizer" or type(donor.objective(name)) in kinds)
+        alike = name in other.stages and (name == "tokenizer" or type(other.objective(name)) in kinds)
         if not alike:
             in_bundle = is_run(named_folder(run) / name)
             raise ConfigError(
-                f"{setting}, a run of the generator {donor.public_name()!r}",
+                f"{setting}, a run of the generator {other.public_name()!r}",
                 f"a run of {generator.public_name()!r}, or of another with the same stage {name!r}",
                 f"set training.{name}.start={run}/{name}" if in_bundle else "choose another run",
             )
-        theirs = _Stage(name, donor)
+        theirs = _Stage(name, other)
         _check(setting, ours, theirs, trained=not config.frozen)
         if config.frozen:
             _check_base(preset, ours)

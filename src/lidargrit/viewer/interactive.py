@@ -25,7 +25,7 @@ from lidargrit.scans.classes import CLASS_BITS, names_and_colours
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import Scan
 from lidargrit.viewer._page import asset, document, part
-from lidargrit.viewer.scan_sets import SURPRISED_BITS, ScanSet
+from lidargrit.viewer.scan_sets import ANOMALOUS_BITS, ScanSet
 
 PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
@@ -40,14 +40,14 @@ _RAMPS = {
         "range": ("viridis_r", 0.0, 0.85),
         "height": ("plasma", 0.12, 1.0),
         "reflectance": ("inferno", 0.25, 1.0),
-        "surprise": ("inferno", 0.25, 1.0),
+        "anomaly": ("inferno", 0.25, 1.0),
         "ring": ("turbo", 0.1, 0.95),
     },
     "light": {
         "range": ("viridis_r", 0.12, 1.0),
         "height": ("plasma", 0.0, 0.88),
         "reflectance": ("inferno_r", 0.18, 1.0),
-        "surprise": ("inferno_r", 0.18, 1.0),
+        "anomaly": ("inferno_r", 0.18, 1.0),
         "ring": ("turbo", 0.03, 0.95),
     },
 }
@@ -144,9 +144,9 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
         scan = {"name": name, "range": _packed(steps.numpy().astype("<u2")), "hidden": hidden}
         if beside is not None:
             scan["beside"] = _packed(beside.points_xyz_m.numpy().astype("<f4"))
-        if scan_set.surprise is not None:
-            share = (scan_set.surprise[index] / SURPRISED_BITS).clamp(0, 1)
-            scan["surprise"] = _packed((255 * share).round().numpy().astype(np.uint8))
+        if scan_set.anomaly is not None:
+            share = (scan_set.anomaly[index] / ANOMALOUS_BITS).clamp(0, 1)
+            scan["anomaly"] = _packed((255 * share).round().numpy().astype(np.uint8))
         if image.reflectance is not None:
             of_all = _followed_by(image.reflectance.detach(), beside, "reflectance")
             scan["reflectance"] = _packed((255 * of_all).round().astype(np.uint8))
@@ -216,7 +216,7 @@ def _scales(sets: Sequence[ScanSet]) -> dict[str, tuple[float, float]]:
         "range": (near, max(far, 1.01 * near)),
         "height": (low, max(high, low + 0.1)),
         "reflectance": (0.0, 1.0),
-        "surprise": (0.0, SURPRISED_BITS),
+        "anomaly": (0.0, ANOMALOUS_BITS),
         "ring": (0.0, 1.0),
     }
 

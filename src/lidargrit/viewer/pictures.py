@@ -24,13 +24,13 @@ from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 from lidargrit.viewer._matplotlib import write_png
 from lidargrit.viewer.report_pictures import NO_RETURN
-from lidargrit.viewer.scan_sets import SURPRISED_BITS
+from lidargrit.viewer.scan_sets import ANOMALOUS_BITS
 
 SCANS_AT_MOST = 8  # scans of a group; more make a picture that no viewer shows well
 _WIDTH, _ROW, _HEAD, _FOOT = 14.0, 2.95, 0.75, 0.95  # inches: the picture, one scan of one group, title, colour bars
 _TICKS_AT_LEAST, _TICKS_AT_MOST = 3, 6  # of elevation: enough to read a row's by, and words that do not overlap
 _FILLED, _FILLED_NOTE = "#e8730c", "\norange = filled in by a model"
-_SURPRISE_NOTE = f"\nsurprise: black = as expected or less,\nyellow = {SURPRISED_BITS:g} bits more or beyond"
+_ANOMALY_NOTE = f"\nanomaly: black = as expected or less,\nyellow = {ANOMALOUS_BITS:g} bits more or beyond"
 _SCANS = 2  # a glance; more would take training's time
 
 
@@ -38,7 +38,7 @@ def plot_comparison(
     groups: dict[str, RangeImage],
     path: Path,
     title: str = "",
-    surprise: dict[str, Float[Tensor, "B H W"]] | None = None,
+    anomaly: dict[str, Float[Tensor, "B H W"]] | None = None,
     filled: dict[str, Bool[Tensor, "B H W"]] | None = None,
 ) -> None:
     """Plot groups of range images below one another: range, return mask and bird's-eye view of every scan.
@@ -48,15 +48,15 @@ def plot_comparison(
 
     Args:
         groups: range images by name ("real", "reconstructed", ...), each one or a batch of 1 to 8; sensors may differ.
-        surprise: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
-            :meth:`lidargrit.scans.types.ScanBits.surprise`.
+        anomaly: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
+            :meth:`lidargrit.scans.types.ScanBits.anomaly`.
         filled: True for pixels whose point a model filled in, by group; they have another colour in the return mask and
             in the bird's-eye view.
     """
     _check(groups)
     rows = [(index, name) for index in range(max(map(len, groups.values()))) for name in groups]
     panels = [
-        _panel(groups[name], index, name, (surprise or {}).get(name), (filled or {}).get(name))
+        _panel(groups[name], index, name, (anomaly or {}).get(name), (filled or {}).get(name))
         for index, name in rows
         if index < len(groups[name])
     ]
@@ -67,7 +67,7 @@ def plot_comparison(
         figure.text(0.5, 1 - 0.42 / height, title, ha="center", va="center", fontsize=17, parse_math=False)
     for row, panel in enumerate(panels):
         _plot_row(figure, height, _FOOT + _ROW * (len(panels) - 1 - row), panel, scales)
-    notes = (_SURPRISE_NOTE if surprise is not None else "") + (_FILLED_NOTE if filled else "")
+    notes = (_ANOMALY_NOTE if anomaly is not None else "") + (_FILLED_NOTE if filled else "")
     _plot_scales(figure, height, scales, notes)
     write_png(figure, path)
 
@@ -79,7 +79,7 @@ class _Panel:
     return_mask: Bool[np.ndarray, "H W"]
     points_xyz_m: Float[np.ndarray, "n 3"]
     elevation_deg: Float[np.ndarray, " H"]
-    surprise: Float[np.ndarray, "H W"] | None = None
+    anomaly: Float[np.ndarray, "H W"] | None = None
     filled: Bool[np.ndarray, "H W"] | None = None
 
 
@@ -120,7 +120,7 @@ def _check(groups: dict[str, RangeImage]) -> None:
             )
 
 
-def _panel(images: RangeImage, index: int, name: str, surprise: Tensor | None, filled: Tensor | None) -> _Panel:
+def _panel(images: RangeImage, index: int, name: str, anomaly: Tensor | None, filled: Tensor | None) -> _Panel:
     image = (images[index] if images.range_m.ndim == 3 else images).to("cpu")
     return _Panel(
         f"scan {index + 1}: {name}",
@@ -128,7 +128,7 @@ def _panel(images: RangeImage, index: int, name: str, surprise: Tensor | None, f
         image.return_mask.numpy(),
         points_of_pixels(image).detach()[image.return_mask].numpy(),
         image.sensor.elevation_rad.double().mean(dim=1).rad2deg().numpy(),
-        None if surprise is None else surprise[index].detach().cpu().numpy(),
+        None if anomaly is None else anomaly[index].detach().cpu().numpy(),
         None if filled is None else filled[index].cpu().numpy(),
     )
 
@@ -153,14 +153,14 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     ranges.set_xticks([])
     mask = axes(0.75, 0.45, 9.9, 1.05)
     shape = {"aspect": "auto", "interpolation": "nearest", "extent": extent}
-    if panel.surprise is None:
+    if panel.anomaly is None:
         kinds = panel.return_mask.astype(int) if panel.filled is None else panel.return_mask * (1 + panel.filled)
         mask.imshow(kinds, cmap=ListedColormap([NO_RETURN, "#26323c", _FILLED]), vmin=0, vmax=2, **shape)
     else:
-        mask.imshow(panel.surprise, cmap="inferno", vmin=0, vmax=SURPRISED_BITS, **shape)
+        mask.imshow(panel.anomaly, cmap="inferno", vmin=0, vmax=ANOMALOUS_BITS, **shape)
     mask.set_xlabel("azimuth, counter-clockwise from forward", fontsize=10, labelpad=0)
     mask.set_xticks(np.arange(180, -181, -45), [f"{d}°" for d in range(180, -181, -45)], fontsize=9)
-    for axis, name in ((ranges, "range"), (mask, "return mask" if panel.surprise is None else "surprise")):
+    for axis, name in ((ranges, "range"), (mask, "return mask" if panel.anomaly is None else "anomaly")):
         axis.set_yticks(*_elevation_ticks(panel.elevation_deg), fontsize=9)
         axis.set_ylabel(name, fontsize=10)
     view = axes(11.3, 0.45, 2.25, 2.25)

@@ -24,7 +24,7 @@ from lidargrit.scans.types import RangeImage, Scan
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BESIDE_AT_MOST = 200_000  # points of a scan on a page that have no pixel: a map of many scans has millions
 _BATCH = 8  # scans computed at once: what a laptop has memory for
-SURPRISED_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
+ANOMALOUS_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
 _NAME_LETTERS = 40  # of a source's name: what fits above a picture
 
 
@@ -34,7 +34,7 @@ class ScanSet:
 
     Args:
         name: name of the scans' source, or of what a model made of it.
-        surprise: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.surprise`; None
+        anomaly: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.anomaly`; None
             if no model was asked.
         filled: True for pixels whose point a model filled in; None where no scan says so.
         beside: points of each scan without a pixel in its image that are shown besides, None for none; empty if the
@@ -46,7 +46,7 @@ class ScanSet:
     name: str
     images: RangeImage
     scan_names: tuple[str, ...]
-    surprise: Float[Tensor, "B H W"] | None = None
+    anomaly: Float[Tensor, "B H W"] | None = None
     filled: Bool[Tensor, "B H W"] | None = None
     beside: tuple[Scan | None, ...] = ()
     hidden: tuple[int, ...] = ()
@@ -94,7 +94,7 @@ def load_scan_sets(
     sets: list[ScanSet] = []
     for source in opened:
         if not isinstance(source, RunSource):
-            rays = _fine(named or config.imaged(source.sensor)) if fine else sensor
+            rays = _fine(named or config.with_projection(source.sensor)) if fine else sensor
             how = (count, rays, config)
             read = _of_scans(source, *how, fine) if isinstance(source, DatasetSource) else _of_images(source, *how)
             sets.append(replace(read, name=_short(source.text)))

@@ -25,14 +25,14 @@ def view(
     count: int = 3,
     seed: int = 0,
     settings: ScanSettings | None = None,
-    surprise_by: str = "",
+    anomaly_by: str = "",
     device: str = "",
 ) -> None:
     """Plot scans, samples, and the scans that runs generate and reconstruct; see also :func:`load_scan_sets`.
 
     Args:
         out: path of the PNG, or of the page if it ends in ``.html``.
-        surprise_by: folder of the run whose surprise at every pixel is a colour of the page, or is plotted in place of
+        anomaly_by: folder of the run whose anomaly at every pixel is a colour of the page, or is plotted in place of
             the return mask; none if empty.
     """
     is_page = out.suffix.lower() == ".html"
@@ -40,20 +40,20 @@ def view(
     if not 1 <= count <= at_most:
         other = "" if is_page else f", or write an .html, which takes {PAGE_SCANS_AT_MOST}"
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", f"correct the number{other}")
-    model = load(surprise_by).to(usable_device(device)) if surprise_by else None
+    model = load(anomaly_by).to(usable_device(device)) if anomaly_by else None
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:
-        sets = [replace(scans, surprise=_surprise(model, scans.images)) for scans in sets]
+        sets = [replace(scans, anomaly=_anomaly(model, scans.images)) for scans in sets]
     for scans in sets:
         _tell_hidden(scans, is_page)
     groups = {scans.name: scans.images for scans in sets}
     if is_page:
         write_page(sets, out)
     else:
-        surprise = {scans.name: scans.surprise for scans in sets if scans.surprise is not None}
+        anomaly = {scans.name: scans.anomaly for scans in sets if scans.anomaly is not None}
         filled = {scans.name: scans.filled for scans in sets if scans.filled is not None}
-        plot_comparison(groups, out, surprise=surprise or None, filled=filled)
+        plot_comparison(groups, out, anomaly=anomaly or None, filled=filled)
 
 
 def _tell_hidden(scans: ScanSet, is_page: bool) -> None:
@@ -69,6 +69,6 @@ def _tell_hidden(scans: ScanSet, is_page: bool) -> None:
         reporting.message(f"{scans.name}: {hidden:,} of {hidden + shown:,} points are hidden, since {why}")
 
 
-def _surprise(model: Generator, images: RangeImage) -> Float[Tensor, "B H W"]:
+def _anomaly(model: Generator, images: RangeImage) -> Float[Tensor, "B H W"]:
     parts = (images[index : index + 1] for index in range(len(images)))
-    return torch.cat([model.bits(part, expected=True).surprise().cpu() for part in parts])
+    return torch.cat([model.bits(part, expected=True).anomaly().cpu() for part in parts])

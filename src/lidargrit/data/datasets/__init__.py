@@ -148,7 +148,7 @@ class ScanDataset(ABC):
         """Return the file that holds a scan; None where scans are not in files."""
         return None
 
-    def companions(self, index: int) -> tuple[Path, ...]:
+    def sidecar_files(self, index: int) -> tuple[Path, ...]:
         """Return the other files that a scan is read from, such as a calibration, where they are there."""
         return ()
 

@@ -57,7 +57,7 @@ class Folder(FileDataset):
 
     @classmethod
     def _find(cls, root: Path) -> list[Path]:
-        return natural_order(_without_companions(scans_below(root))[0])
+        return natural_order(_without_sidecar_files(scans_below(root))[0])
 
     def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""
@@ -68,7 +68,7 @@ class Folder(FileDataset):
         return unnamed_recording(path)
 
 
-def _without_companions(found: Iterable[Path]) -> tuple[list[Path], list[Path]]:
+def _without_sidecar_files(found: Iterable[Path]) -> tuple[list[Path], list[Path]]:
     """Divide files into scans and what lies beside them: pictures, poses and labels, voxels of SemanticKITTI.
 
     Of endings that other files have as well, the first file in each folder tells; without scans of other endings all of
@@ -98,7 +98,7 @@ def _left_out(root: Path, count: int) -> tuple[str, ...]:
     """Return notes on files of a folder that are no scans, or not read."""
     if not root.is_dir():
         return ()
-    beside = _without_companions(scans_below(root))[1]
+    beside = _without_sidecar_files(scans_below(root))[1]
     endings = ", ".join(sorted({path.suffix.lower() for path in beside}))
     example = f"such as {printable(beside[0].name)[:80]}" if beside else ""
     notes = (

@@ -75,7 +75,7 @@ class KittiOdometry(FileDataset):
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
         scan, path = super().scan(index), self.path(index)
-        (labels,) = self.companions(index)
+        (labels,) = self.sidecar_files(index)
         if not labels.is_file():
             return scan
         data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
@@ -92,7 +92,7 @@ class KittiOdometry(FileDataset):
             label = label[usable_points(points[:, :3], points[:, 3])]
         return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))
 
-    def companions(self, index: int) -> tuple[Path, ...]:
+    def sidecar_files(self, index: int) -> tuple[Path, ...]:
         """Return the file of a scan's labels."""
         path = self.path(index)
         return (path.parents[1] / "labels" / f"{path.stem}.label",)

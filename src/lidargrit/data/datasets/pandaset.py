@@ -33,10 +33,10 @@ class Pandaset(FileDataset):
             return Motion()
         return Motion(float(known.times_s[int(number)]), torch.from_numpy(known.poses[int(number)].copy()))
 
-    def companions(self, index: int) -> tuple[Path, ...]:
+    def sidecar_files(self, index: int) -> tuple[Path, ...]:
         """Return the poses and times of a scan's drive, and its labels."""
         path = self.path(index)
-        return self._format(path).companions(path)
+        return self._format(path).sidecar_files(path)
 
     def sequence_of(self, relative: Path) -> str:
         """Name the drive of a file: "001"."""

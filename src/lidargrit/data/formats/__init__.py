@@ -120,7 +120,7 @@ class ScanFormat(ABC):
         return type(cls.__name__, (cls,), {**bound, "__module__": cls.__module__})
 
     @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
+    def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the other files that :meth:`read` reads, where they are there."""
         return ()
 

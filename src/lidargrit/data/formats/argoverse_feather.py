@@ -96,7 +96,7 @@ class ArgoverseFeather(ScanFormat):
         )
 
     @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
+    def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the calibration of the file's log."""
         return (path.absolute().parent.parent.parent / "calibration" / "egovehicle_SE3_sensor.feather",)
 
@@ -158,7 +158,7 @@ def _rings(
 
 def _pose(path: Path, name: str) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
     """Return the pose of a sensor in the car, from the log's calibration if the file lies in a log that has one."""
-    (calibration,) = ArgoverseFeather.companions(path)
+    (calibration,) = ArgoverseFeather.sidecar_files(path)
     if not calibration.is_file():
         return _axes_and_origin(_NOMINAL[name])
     wanted = f"the columns sensor_name, {', '.join(_POSE_COLUMNS)}"

@@ -66,7 +66,7 @@ class NumpyArray(ColumnFormat):
         return right_handed(scan_of_columns(columns, path, bad_points, names, are_named=bool(names)), columns)
 
     @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
+    def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the marks of filled points beside an ``.npy``; an ``.npz`` holds them itself."""
         return (marks_file(path),) if path.suffix.lower() == ".npy" else ()
 

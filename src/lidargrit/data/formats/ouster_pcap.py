@@ -75,7 +75,7 @@ class OusterPcap(ScanFormat):
         return scan_of(points_xyz_m, reflectance, ring, f"{path}#{index}", bad_points, point_time_s=fired_s)
 
     @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
+    def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the file of the sensor's metadata."""
         return (path.with_suffix(".json"),)
 

@@ -88,7 +88,7 @@ class PandasetPkl(ScanFormat):
         return replace(scan, notes=(*scan.notes, note)) if before > _BEFORE_AT_MOST else scan
 
     @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
+    def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the poses and times of the drive, and the labels of the frame."""
         return (path.with_name("poses.json"), path.with_name("timestamps.json"), _labels_of(path))
 

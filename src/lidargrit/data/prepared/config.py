@@ -56,9 +56,9 @@ class DataConfig(Settings):
 
     def load_sensor(self) -> SensorModel:
         """Return the sensor with these columns and this projection."""
-        return self.imaged(load_sensor(self.sensor))
+        return self.with_projection(load_sensor(self.sensor))
 
-    def imaged(self, sensor: SensorModel) -> SensorModel:
+    def with_projection(self, sensor: SensorModel) -> SensorModel:
         """Return another sensor with these columns and this projection."""
         if self.columns:
             sensor = sensor.with_columns(self.columns, self.column_stride)

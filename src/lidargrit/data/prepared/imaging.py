@@ -16,7 +16,7 @@ _PROBES = 3  # scans that are looked at: the first would do, were a folder not s
 
 
 @dataclass(frozen=True, eq=False)
-class Imaging:
+class ProjectionChoice:
     """Settings by which the scans of one set become images.
 
     Args:
@@ -38,7 +38,7 @@ class Imaging:
             reporting.message(line)
 
 
-def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> Imaging:
+def choose_projection(source: str, dataset: ScanDataset, sensor: SensorModel, config: DataConfig) -> ProjectionChoice:
     """Look at a few scans of a set, and choose the projection for all of them.
 
     Points that are not in firing order get their rows by elevation, in the exact variant, since their order does not
@@ -60,7 +60,7 @@ def choose_imaging(source: str, dataset: ScanDataset, sensor: SensorModel, confi
         notes.append(f"{source}: points that are not in firing order, so rows go by elevation (projection=spherical)")
     told_of_scans = (told_doubts(scan, sensor, sensor.projection, source) for scan in probes)
     first_of_each = (next(filter(None, told), "") for told in zip(*told_of_scans, strict=True))
-    return Imaging(sensor, config, tuple(notes), tuple(filter(None, first_of_each)))
+    return ProjectionChoice(sensor, config, tuple(notes), tuple(filter(None, first_of_each)))
 
 
 def _probes(dataset: ScanDataset, sensor: SensorModel) -> list[Scan]:

@@ -19,7 +19,7 @@ from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.prepared.arrays import range_step_m
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.prepared.imaging import choose_imaging
+from lidargrit.data.prepared.imaging import choose_projection
 from lidargrit.data.prepared.plan import ARRAYS, FORMAT, MADE_FOLDER, PLAN_FILE, SCANS_FILE, PreparedSpec, made_name
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages
 from lidargrit.data.prepared.workers import make_shards
@@ -81,7 +81,7 @@ def prepare(
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PrepareReport:
     """Size and content of a prepared folder.
 
     Args:
@@ -121,7 +121,7 @@ def prepare_and_describe(
     world_size: int | None = None,
     verify: bool = False,
     ray: str = "",
-) -> Prepared:
+) -> PrepareReport:
     """Prepare a source and return what the folder holds.
 
     Args:
@@ -129,7 +129,7 @@ def prepare_and_describe(
         verify: whether to read every image back and make damaged shards again.
     """
     begun = time.monotonic()
-    imaging = choose_imaging(source, dataset, config.load_sensor(), config)
+    imaging = choose_projection(source, dataset, config.load_sensor(), config)
     imaging.report()
     config, sensor = imaging.config, imaging.sensor
     folder = prepare(source, config, folder, sensor, rank, world_size, dataset, ray)
@@ -145,7 +145,7 @@ def prepare_and_describe(
         raise no_usable_scan(source)
     size = sum(path.stat().st_size for path in (folder / ARRAYS).rglob("*") if path.is_file())
     shape = images.sensor.height, images.sensor.width
-    return Prepared(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
+    return PrepareReport(folder, len(images), *shape, size, seconds, tuple(images.left_out.values()))
 
 
 def damaged_shards(folder: Path, rank: int | None = None, world_size: int | None = None) -> list[int]:
@@ -190,7 +190,7 @@ def _spec(
         )
         size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
         scans.append((name, dataset.recording(index), size, time_ns, *_time_and_pose(dataset, index)))
-        beside += filter(None, map(_state, dataset.companions(index)))
+        beside += filter(None, map(_state, dataset.sidecar_files(index)))
     others = json.dumps(beside) if beside else ""
     # A file of a sensor by which scans are simulated may change, and its name stays the same.
     if dataset.sensor.lower().endswith(".json"):

@@ -11,7 +11,7 @@ from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.prepared.imaging import Imaging, choose_imaging
+from lidargrit.data.prepared.imaging import ProjectionChoice, choose_projection
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages, is_prepared
 from lidargrit.data.run_folder import is_run, is_unfinished, locate, read_config, recorded_projection
@@ -86,13 +86,13 @@ class DatasetSource(Source):
         _require_some(self.text, prepared)
         return RangeImages(sensor, [prepared])
 
-    def imaging(self, sensor: SensorModel | None, config: DataConfig) -> Imaging:
-        """Choose how the scans become images: see :func:`lidargrit.data.prepared.imaging.choose_imaging`.
+    def imaging(self, sensor: SensorModel | None, config: DataConfig) -> ProjectionChoice:
+        """Choose how the scans become images: see :func:`lidargrit.data.prepared.imaging.choose_projection`.
 
         Args:
             sensor: sensor of the images; the data set's own, with the configuration's columns, if not given.
         """
-        return choose_imaging(self.text, self._dataset, sensor or config.imaged(self.sensor), config)
+        return choose_projection(self.text, self._dataset, sensor or config.with_projection(self.sensor), config)
 
 
 class PreparedSource(Source):

@@ -77,7 +77,7 @@ class CutSource(Source):
         return _imaged(
             lambda index: _first_points(scans.scan(index), self._num_points),
             len(scans),
-            sensor or config.imaged(self.sensor),
+            sensor or config.with_projection(self.sensor),
             config,
             Provenance(names, drives),
         )

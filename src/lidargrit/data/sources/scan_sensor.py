@@ -26,7 +26,7 @@ def sensor_for_run(settings: ScanSettings, scans: str, model: str, job: Job = "s
     if not takes_any_sensor(locate(model, job)):
         refuse_other_sensor(settings, model, job)
         return None
-    return settings.data.imaged(sensor_for(open_source(scans, settings.data.bad_points), settings.sensor))
+    return settings.data.with_projection(sensor_for(open_source(scans, settings.data.bad_points), settings.sensor))
 
 
 def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample") -> None:
@@ -34,7 +34,7 @@ def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample")
     if not (settings.sensor or settings.data.columns):
         return
     own = RunSource(model, locate(model, job)).sensor
-    sensor = settings.load_sensor() or settings.data.imaged(own.fine())
+    sensor = settings.load_sensor() or settings.data.with_projection(own.fine())
     if not own.same_rays(sensor):
         raise other_sensor(sensor, own, model, settings.sensor)
 

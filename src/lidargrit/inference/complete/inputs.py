@@ -212,7 +212,7 @@ def images_for(models: Sequence[Model], source: str, settings: ScanSettings) -> 
     if {*learned} - {variant}:
         reporting.message(f"WARNING: scans are projected by {variant!r}, and some models learned from other images")
     data = replace(settings.data, projection_variant=variant)
-    return open_images(source, data.imaged(models[0].sensor), data)
+    return open_images(source, data.with_projection(models[0].sensor), data)
 
 
 def open_inputs(source: str, reader: ScanReader, config: DataConfig) -> Inputs:

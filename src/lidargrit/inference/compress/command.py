@@ -243,7 +243,7 @@ def _header(codec: ScanCodec, model: str, given: SensorModel | None) -> dict[str
     rays = {} if given is None else {"rays": given.to_json()}
     return {
         **rays,
-        "model": Path(model).name,
+        "model": Path(model).name if Path(model).exists() else model,  # such as pretrained/forecaster
         "model_sha256": codec.digest(),
         "step_mm": codec.steps.step_mm,
         "sensor": sensor.name,

@@ -19,15 +19,15 @@ from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion.hints import (
+from lidargrit.systems.completion.classical_features import (
     LABELLED,
     NUM_CANDIDATES,
     NUM_LABELS,
     NUM_MAPS,
     NUM_REFLECTANCES,
     REFLECTING,
-    Hints,
-    hints_of,
+    ClassicalFeatures,
+    classical_features,
 )
 
 _TRUST = 3.0  # logit by which triangulation is preferred to the other candidates at first
@@ -75,7 +75,7 @@ class CompletionNetworkConfig(Settings):
             )
 
 
-class Point(NamedTuple):
+class CompletionOutput(NamedTuple):
     """Point estimate of every pixel by the network.
 
     Args:
@@ -125,7 +125,7 @@ class CompletionNetwork(nn.Module):
     preferred: Tensor
     azimuth: Tensor
 
-    def forward(self, hints: Hints, observed: Bool[Tensor, "B H W"]) -> Point:
+    def forward(self, classical: ClassicalFeatures, observed: Bool[Tensor, "B H W"]) -> CompletionOutput:
         """Return the estimate of every pixel.
 
         Args:
@@ -134,32 +134,34 @@ class CompletionNetwork(nn.Module):
         rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
         columns = self.azimuth[None, :, None].expand(len(observed), -1, observed.shape[-2], -1)
         more: dict[str, Tensor] = {}
-        seen, indices = hints.reflectances, None
+        seen, indices = classical.reflectances, None
         if self.classes is not None:
-            label = hints.labels
+            label = classical.labels
             if label is None:
-                label = hints.maps.new_zeros((len(observed), NUM_LABELS, *observed.shape[1:]), dtype=torch.int64)
+                label = classical.maps.new_zeros((len(observed), NUM_LABELS, *observed.shape[1:]), dtype=torch.int64)
             indices = class_indices(label)
             more["labels"] = self.classes(indices)
         if self.config.reflectance:
             if seen is None:
-                seen = hints.maps.new_full((len(observed), NUM_REFLECTANCES, *observed.shape[1:]), TYPICAL_REFLECTANCE)
+                seen = classical.maps.new_full(
+                    (len(observed), NUM_REFLECTANCES, *observed.shape[1:]), TYPICAL_REFLECTANCE
+                )
             more["reflectance"] = seen - TYPICAL_REFLECTANCE
-        output, of_parts = self.unet(torch.cat((hints.maps, rows, columns), 1), more)
+        output, of_parts = self.unet(torch.cat((classical.maps, rows, columns), 1), more)
         features, weights, moved, logits = output.float().split(self.outputs, 1)
         shares = (4 * weights + self.preferred).softmax(1)
-        v = (shares * hints.candidates).sum(1) + 0.3 * moved[:, 0]
+        v = (shares * classical.candidates).sum(1) + 0.3 * moved[:, 0]
         return_logits = (2 * logits[:, 0] + 1.5).clamp(-LOGIT_BOUND, LOGIT_BOUND)
         v = v.clamp(*self.limits_v)
         class_logits, reflectance = None, None
         if indices is not None:
             alone, trust = of_parts["labels"].float().split([NUM_CLASSES, NUM_LABELS], 1)
-            class_logits = 2 * alone + _VOTE * votes(indices, self._shares(trust, hints.candidates[:, LABELLED], v))
+            class_logits = 2 * alone + _VOTE * votes(indices, self._shares(trust, classical.candidates[:, LABELLED], v))
         if self.config.reflectance and seen is not None:
             alone, trust = of_parts["reflectance"].float().split([1, NUM_REFLECTANCES], 1)
-            reflectance = alone[:, 0] + (seen * self._shares(trust, hints.candidates[:, REFLECTING], v)).sum(1)
+            reflectance = alone[:, 0] + (seen * self._shares(trust, classical.candidates[:, REFLECTING], v)).sum(1)
         guide = Guide(features, v.detach(), return_logits.detach(), observed)
-        return Point(guide, v, return_logits, class_logits, reflectance)
+        return CompletionOutput(guide, v, return_logits, class_logits, reflectance)
 
     def _shares(
         self, trust: Float[Tensor, "B S H W"], candidates: Float[Tensor, "B S H W"], v: Float[Tensor, "B H W"]
@@ -180,17 +182,24 @@ class CompletionNetwork(nn.Module):
         images, uniform = [], self.mask.uniform(rngs)
         for index in range(len(rngs)):
             one = condition[index : index + 1]
-            learned = {"label": self.config.labels, "reflectance": self.config.reflectance}  # others need no hints
+            learned = {"label": self.config.labels, "reflectance": self.config.reflectance}  # others need no features
             shown = replace(one, planes={name: pixels for name, pixels in one.planes.items() if learned.get(name)})
-            hints = hints_of(shown)
-            point, mirrored = self(hints, one.return_observed), self(hints.mirrored(), one.return_observed.flip(-1))
+            classical = classical_features(shown)
+            point, mirrored = (
+                self(classical, one.return_observed),
+                self(classical.mirrored(), one.return_observed.flip(-1)),
+            )
             v = (point.v + mirrored.v.flip(-1)) / 2
             mask = self.mask.sample(point.guide, uniform[index : index + 1], one)
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
             planes = dict[str, Tensor]()
-            if hints.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:
+            if classical.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:
                 planes["label"] = labels_of((point.class_logits + mirrored.class_logits.flip(-1)).argmax(1) + 1)
-            if hints.reflectances is not None and point.reflectance is not None and mirrored.reflectance is not None:
+            if (
+                classical.reflectances is not None
+                and point.reflectance is not None
+                and mirrored.reflectance is not None
+            ):
                 planes["reflectance"] = ((point.reflectance + mirrored.reflectance.flip(-1)) / 2).clamp(0, 1)
             range_m = v.expm1().clamp(low_m, high_m)
             images.append(RangeImage.masked(range_m, mask, condition.sensor, planes))

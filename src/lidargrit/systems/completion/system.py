@@ -21,7 +21,7 @@ from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.completion.hints import hints_of
+from lidargrit.systems.completion.classical_features import classical_features
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
 
 _ROW_STEPS = (2, 4, 4, 8)  # one of so many rows is observed; four as often as the others together
@@ -65,9 +65,9 @@ class CompletionObjective(Objective):
         """
         images, rng = example.images, of_host(rng)
         observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
-        # Hints are searched for on the host, so all that they need is brought there once.
+        # Features are searched for on the host, so all that they need is brought there once.
         condition, learned = Observed.of_pixels(images.to("cpu"), observed), self.completion.config
-        planes = dict[str, Tensor]()  # no hints are computed of what the network does not see
+        planes = dict[str, Tensor]()  # no features are computed of what the network does not see
         if learned.labels:
             planes["label"] = hidden_in_some(labels_to_learn(condition.label), 0, _WITHOUT, rng)
         if learned.reflectance:
@@ -75,7 +75,7 @@ class CompletionObjective(Objective):
             planes["reflectance"] = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
         condition = replace(condition, planes=planes)
         observed = observed.to(images.range_m.device)
-        point = self.completion(hints_of(condition, images.range_m.device), observed)
+        point = self.completion(classical_features(condition, images.range_m.device), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
         count, num_returns = hidden.sum((1, 2)).clamp(min=1), returns.sum((1, 2)).clamp(min=1)

@@ -1,7 +1,7 @@
 """LidarGAN's two convolutional networks, and the losses of GAN and VAE: latents → images, images → vectors."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -14,7 +14,6 @@ from lidargrit.nn.published import read_checkpoint
 IMAGE_CHANNELS = 2  # horizontal distance and height
 _BYTES_AT_MOST = 1 << 29  # the largest published network takes 120 MB
 
-AdversarialLoss = Literal["relativistic", "plain"]
 
 _SLOPE = 0.2  # of the leaky rectifier below 0
 
@@ -99,26 +98,18 @@ def _start(network: nn.Module, initial_std: float) -> None:
             nn.init.normal_(module.weight, 1.0, initial_std)
 
 
-def discriminator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
-    """Return the least-squares loss of the discriminator.
+def relativistic_loss(of_own: Float[Tensor, "B"], of_other: Float[Tensor, "B"]) -> Tensor:
+    """Return a player's least-squares loss: outputs are wanted 1 above the other images' mean, and theirs 1 below.
 
     Args:
-        kind: ``plain`` compares each output with a constant, 1 for real and 0 for generated (Mao et al., LSGAN, 2017).
-            ``relativistic`` compares it with the mean output for the other images: 1 above it, 1 below it
-            (Jolicoeur-Martineau, The relativistic discriminator, 2019).
+        of_own: discriminator's outputs for the images that the player wants to look real.
+        of_other: outputs for the other images.
+
+    Source:
+        Jolicoeur-Martineau, The relativistic discriminator, 2019.
     """
-    if kind == "plain":
-        return ((of_real - 1).square().mean() + of_generated.square().mean()) / 2
-    return (
-        (of_real - of_generated.mean() - 1).square().mean() + (of_generated - of_real.mean() + 1).square().mean()
-    ) / 2
-
-
-def generator_loss(of_real: Float[Tensor, "B"], of_generated: Float[Tensor, "B"], kind: AdversarialLoss) -> Tensor:
-    """Return the loss of the generator; the arguments are those of :func:`discriminator_loss`."""
-    if kind == "plain":
-        return (of_generated - 1).square().mean()
-    return discriminator_loss(of_generated, of_real, kind)
+    above, below = of_own - of_other.mean() - 1, of_other - of_own.mean() + 1
+    return (above.square().mean() + below.square().mean()) / 2
 
 
 def kl_nats(mean: Float[Tensor, "B D"], log_variance: Float[Tensor, "B D"]) -> Float[Tensor, "B"]:

@@ -23,27 +23,23 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargan.filled_rows import FilledRows
 from lidargrit.systems.lidargan.networks import (
-    AdversarialLoss,
     Decoder,
     Encoder,
     InitialStd,
-    discriminator_loss,
-    generator_loss,
     read_published_sizes,
+    relativistic_loss,
 )
 
 
 @dataclass(frozen=True)
 class LidarGanConfig(Settings):
-    """Networks and loss of LidarGAN; the defaults are the published ones.
+    """Networks of LidarGAN; the defaults are the published ones.
 
     Args:
         channels: number of channels of the finest level of both networks; each of the three coarser levels has twice as
             many.
         rows: number of rows that are generated: 24, 40, 56 or more in steps of 16.
         first_row: index of the highest of these rows. The program leaves out the highest 17 and the lowest 7 of 64.
-        loss: least-squares loss of both networks. ``relativistic`` compares the discriminator's outputs for real and
-            generated images with each other, as in the released run; ``plain`` with constants.
         initial_std: standard deviation of the new weights of both networks.
     """
 
@@ -51,7 +47,6 @@ class LidarGanConfig(Settings):
     channels: Count = 64
     rows: int = 40
     first_row: int = 17
-    loss: AdversarialLoss = "relativistic"
     initial_std: InitialStd = 0.02
 
 
@@ -113,7 +108,7 @@ class LidarGan(Generator[LidarGanConfig, SamplingSettings]):
     ) -> tuple[LidarGanConfig, dict[str, dict[str, Tensor]]]:
         """Read one file of weights, such as ``gen_999.pth``; see :func:`read_published_sizes`."""
         weights, latent_dim, channels = read_published_sizes(files[0], "generator", "main.0", "main.12")
-        return LidarGanConfig(latent_dim, channels, config.rows, config.first_row, config.loss), {"decoder": weights}
+        return LidarGanConfig(latent_dim, channels, config.rows, config.first_row), {"decoder": weights}
 
 
 class LidarGanObjective(Objective):
@@ -139,11 +134,11 @@ class LidarGanObjective(Objective):
             with torch.no_grad():
                 generated = self.decoder(latents)
             of_real, of_generated = self._judged(real, {}), self._judged(generated, {})
-            loss = discriminator_loss(of_real, of_generated, self.config.loss)
+            loss = relativistic_loss(of_real, of_generated)
         else:
             frozen = {name: weight.detach() for name, weight in self.discriminator.named_parameters()}
             of_real, of_generated = self._judged(real, frozen), self._judged(self.decoder(latents), frozen)
-            loss = generator_loss(of_real, of_generated, self.config.loss)
+            loss = relativistic_loss(of_generated, of_real)
         return {"loss": loss, "of_real": of_real.detach().mean(), "of_generated": of_generated.detach().mean()}
 
     def _judged(self, images: Float[Tensor, "B 2 H W"], weights: dict[str, Tensor]) -> Float[Tensor, "B"]:

@@ -103,7 +103,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         super().__init__(config, sensor)
         height, width = self.tokenizer.grid_size
         self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
-        self._prepared: _Prepared | None = None
+        self._decoder_cache: _DecoderCache | None = None
         self._one_at_a_time = threading.Lock()
 
     def transformer_objective(self) -> Objective:
@@ -169,24 +169,26 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         guidance = self._guidance(sampling)
         choices = (sampling.temperature, sampling.top_k, sampling.top_p, guidance, sampling.weights, sampling.decoder)
         key = (batch_size, choices, places)
-        if self._prepared is None or not self._prepared.serves(key, weights):
-            self._prepared = None  # its cache is given back before the next is taken
+        if self._decoder_cache is None or not self._decoder_cache.serves(key, weights):
+            self._decoder_cache = None  # its cache is given back before the next is taken
             by_choices = partial(sample_token, sampling=sampling)
             decoder = CachedDecoder(
                 self.transformer, batch_size, by_choices, START_TOKEN, sampling.weights, guidance=guidance
             )
             copies = {name: each.clone() for name, each in weights.items()}
-            self._prepared = _Prepared(key, copies, decoder, self.tokenizer.for_decoding(sampling.decoder))
-        return self._prepared.decoder, self._prepared.tokenizer
+            self._decoder_cache = _DecoderCache(key, copies, decoder, self.tokenizer.for_decoding(sampling.decoder))
+        return self._decoder_cache.decoder, self._decoder_cache.tokenizer
 
     def __getstate__(self) -> dict[str, object]:
         """Leave out what can be made again: functions and locks cannot be pickled."""
-        return {name: value for name, value in self.__dict__.items() if name not in ("_prepared", "_one_at_a_time")}
+        return {
+            name: value for name, value in self.__dict__.items() if name not in ("_decoder_cache", "_one_at_a_time")
+        }
 
     def __setstate__(self, state: dict[str, object]) -> None:
         """Make again what was left out."""
         super().__setstate__(state)
-        self._prepared, self._one_at_a_time = None, threading.Lock()
+        self._decoder_cache, self._one_at_a_time = None, threading.Lock()
 
     @classmethod
     def read_published(
@@ -207,7 +209,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return config, networks
 
 
-class _Prepared(NamedTuple):
+class _DecoderCache(NamedTuple):
     key: object
     weights: Mapping[str, Tensor]
     decoder: CachedDecoder

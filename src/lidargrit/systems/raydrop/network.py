@@ -65,7 +65,7 @@ class RaydropNetworkConfig(Settings):
             )
 
 
-class Returns(NamedTuple):
+class RaydropOutput(NamedTuple):
     """Output of the network for every ray.
 
     Args:
@@ -108,7 +108,7 @@ class RaydropNetwork(nn.Module):
         range_m: Float[Tensor, "B H W"],
         surface: Bool[Tensor, "B H W"],
         label: Int[Tensor, "B H W"] | None = None,
-    ) -> Returns:
+    ) -> RaydropOutput:
         """Return features and logits of every ray.
 
         Args:
@@ -129,7 +129,7 @@ class RaydropNetwork(nn.Module):
         reflectance = None
         if self.config.reflectance:
             reflectance = TYPICAL_REFLECTANCE + of_parts["reflectance"].float()[:, 0]
-        return Returns(Guide(features, v, logits.detach(), ~surface), logits, reflectance)
+        return RaydropOutput(Guide(features, v, logits.detach(), ~surface), logits, reflectance)
 
     def sample(self, condition: Observed, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return the surfaces that return, of each scan by its own random numbers; ranges stay as they are.

@@ -43,7 +43,7 @@ _REST_STEPS = 1000  # between two k-means
 _ROUNDS = 50  # of k-means
 
 
-class CodebookCare(nn.Module):
+class CodebookRestart(nn.Module):
     """Watches how a codebook is used in training, and moves its codes when too many lie idle.
 
     The latents of the last hundred steps are kept as a reservoir. When more than 3 % of the codes have not been chosen
@@ -274,7 +274,7 @@ class VoxelReconstruction(Objective):
     def __init__(self, autoencoder: VoxelAutoencoder, sensor: SensorModel, flips: bool) -> None:
         super().__init__(sensor)
         self.autoencoder, self._flips = autoencoder, flips
-        self.care = CodebookCare(autoencoder.config.num_codes, autoencoder.config.code_dim)
+        self.care = CodebookRestart(autoencoder.config.num_codes, autoencoder.config.code_dim)
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return 100 times a voxel's error and 10 times its code's as ``loss``; beside it both, and the IoU."""

@@ -51,10 +51,10 @@ class Page {
   // Only what some scan has.
   offerModes() {
     const has = (name) => this.panes.some((pane) => pane.source.data.scans.some((scan) => scan[name]));
-    for (const name of ["reflectance", "surprise", "label", "filled"]) {
+    for (const name of ["reflectance", "anomaly", "label", "filled"]) {
       this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
     }
-    this.offered ??= ["surprise", "filled"].find(has);
+    this.offered ??= ["anomaly", "filled"].find(has);
     if (this.offered && !this.chosen) {
       this.chosen = true;
       this.control.mode.value = this.offered;
@@ -217,7 +217,7 @@ function legendOf(look) {
     range: [`${low} m`, `${high} m away`],
     height: [`${low} m`, `${high} m above the sensor`],
     reflectance: ["weak, 0", "1, strong"],
-    surprise: ["as expected or less", `${high} bits more than expected, or beyond`],
+    anomaly: ["as expected or less", `${high} bits more than expected, or beyond`],
     ring: ["top row", "bottom row"],
   }[look.mode];
   return [text(ends[0]), ramp, text(ends[1]), chip(css(look.noReturn), "no return")];

@@ -125,7 +125,7 @@ class Pane {
     const pixels = colours.subarray(0, 4 * this.source.size);
     const picture = new ImageData(pixels, this.source.width, this.source.height);
     this.part.image.getContext("2d").putImageData(picture, 0, 0);
-    const missing = ["reflectance", "surprise", "label"].includes(look.mode) && !this.scan[look.mode];
+    const missing = ["reflectance", "anomaly", "label"].includes(look.mode) && !this.scan[look.mode];
     this.part.missing.textContent = missing ? `No ${look.mode} is known here.` : "";
   }
 
@@ -192,9 +192,9 @@ class Pane {
     if (scan.reflectance && returned) {
       facts.push(`reflectance ${(scan.reflectance[pixel] / 255).toFixed(2)}`);
     }
-    if (scan.surprise && returned) {
-      const share = scan.surprise[pixel] / 255;
-      facts.push(`surprise ${(share * this.page.data.scales.surprise[1]).toFixed(1)} bits${share === 1 ? " or more" : ""}`);
+    if (scan.anomaly && returned) {
+      const share = scan.anomaly[pixel] / 255;
+      facts.push(`anomaly ${(share * this.page.data.scales.anomaly[1]).toFixed(1)} bits${share === 1 ? " or more" : ""}`);
     }
     const place = `row ${Math.floor(pixel / source.width)}, column ${pixel % source.width}`;
     return `${facts.join(", ")} (${pixel < source.size ? place : "no pixel of its own"})`;

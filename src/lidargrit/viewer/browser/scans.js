@@ -52,7 +52,7 @@ async function unpackScan(source, data) {
     returns, // from pixels
     hidden: data.hidden,
     reflectance: data.reflectance && new Uint8Array(await unpack(data.reflectance)),
-    surprise: data.surprise && new Uint8Array(await unpack(data.surprise)),
+    anomaly: data.anomaly && new Uint8Array(await unpack(data.anomaly)),
     label: data.label && new Uint8Array(await unpack(data.label)),
     filled: data.filled && new Uint8Array(await unpack(data.filled)),
   };
@@ -115,7 +115,7 @@ const POSITIONS = {
     Math.log(rangeM(source, scan, pixel) / near) / Math.log(far / near),
   height: (source, scan, points, [low, high]) => (pixel) => (points[4 * pixel + 2] - low) / (high - low),
   reflectance: (source, scan) => scan.reflectance && ((pixel) => scan.reflectance[pixel] / 255),
-  surprise: (source, scan) => scan.surprise && ((pixel) => scan.surprise[pixel] / 255),
+  anomaly: (source, scan) => scan.anomaly && ((pixel) => scan.anomaly[pixel] / 255),
   ring: (source) => (pixel) =>
     pixel < source.size ? Math.floor(pixel / source.width) / Math.max(1, source.height - 1) : NaN,
 };

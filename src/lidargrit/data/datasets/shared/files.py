@@ -121,11 +121,11 @@ class FileDataset(ScanDataset):
         path = self.path(index)
         return Motion() if path in self._several else motion_beside(path)
 
-    def companions(self, index: int) -> tuple[Path, ...]:
+    def sidecar_files(self, index: int) -> tuple[Path, ...]:
         """Return the other files that a scan is read from; tells formats apart by the ending, without opening any."""
         path = self.path(index)
         forms = [formats.load(self.format)] if self.format else formats.candidates(path)
-        return tuple(companion for form in forms for companion in form.companions(path))
+        return tuple(companion for form in forms for companion in form.sidecar_files(path))
 
     def recording(self, index: int) -> str:
         """Name the recording that a scan was cut from, the same in every data set that has it."""

@@ -82,7 +82,7 @@ class LibraryDataset(FileDataset):
         path, number = self._scans[index]
         return self._opened(path).motion(number)
 
-    def companions(self, index: int) -> tuple[Path, ...]:
+    def sidecar_files(self, index: int) -> tuple[Path, ...]:
         """Return nothing: the library finds what lies beside a file."""
         return ()
 

@@ -34,7 +34,7 @@ class BareRowFormat(ScanFormat):
     columns: ClassVar[tuple[str, ...]]
 
     @staticmethod
-    def companions(path: Path) -> tuple[Path, ...]:
+    def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the marks of filled points."""
         return (marks_file(path),)
 

@@ -22,7 +22,7 @@ CONFIG = DataConfig(workers=1)
 def test_every_format_that_tells_of_a_companion_names_its_file(tmp_path):
     for name in names("formats"):
         form = formats.load(name)
-        assert bool(form.companion) <= bool(form.companions(tmp_path / f"a{form.suffixes[0]}"))
+        assert bool(form.companion) <= bool(form.sidecar_files(tmp_path / f"a{form.suffixes[0]}"))
 
 
 def test_labels_that_come_later_make_prepared_scans_stale(tmp_path):
@@ -32,7 +32,7 @@ def test_labels_that_come_later_make_prepared_scans_stale(tmp_path):
     cached = prepare(source, CONFIG)
     prepare(source, CONFIG, out)
     dataset = KittiOdometry(tree)
-    (labels,) = dataset.companions(0)
+    (labels,) = dataset.sidecar_files(0)
     labels.parent.mkdir()
     np.full(len(dataset.scan(0)), 40, "<u4").tofile(labels)
     with pytest.raises(OutputError, match="stale"):
@@ -51,7 +51,7 @@ def test_a_calibration_belongs_to_the_scans_of_its_log(named, tmp_path):
     pytest.importorskip("pyarrow")
     Argoverse2.write_example(tmp_path / "tree", 1)
     dataset = open_dataset(f"{named}:{tmp_path / 'tree'}")
-    (calibration,) = dataset.companions(0)
+    (calibration,) = dataset.sidecar_files(0)
     assert calibration.parent.name == "calibration"
     assert calibration.parent.parent == dataset.path(0).parents[2]
 
@@ -62,7 +62,7 @@ def test_metadata_that_changes_opens_a_recording_anew(tmp_path, monkeypatch):
     monkeypatch.setattr(ouster_pcap, "_open_once", lambda *key: opened.append(key) or (None, None, 0.0, np.zeros(1)))
     recording, metadata = tmp_path / "a.pcap", tmp_path / "a.json"
     recording.write_bytes(b"packets")
-    assert ouster_pcap.OusterPcap.companions(recording) == (metadata,)
+    assert ouster_pcap.OusterPcap.sidecar_files(recording) == (metadata,)
     for text in (json.dumps({"a": 1}), json.dumps({"a": 1}), json.dumps({"a": 10})):
         if not metadata.exists() or metadata.read_text() != text:
             metadata.write_text(text)

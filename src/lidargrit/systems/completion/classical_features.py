@@ -25,7 +25,7 @@ _FAR_PIXELS, _FARTHEST = 16.0, 4.0  # a distance is told in units of 16 pixels, 
 _WINDOW = 9  # rows and columns in which shares are counted
 
 
-class Hints(NamedTuple):
+class ClassicalFeatures(NamedTuple):
     """Inputs of a completion network from classical methods, for every pixel; ranges are ln(1 + range in metres).
 
     Args:
@@ -47,17 +47,17 @@ class Hints(NamedTuple):
     labels: Int[Tensor, "B 5 H W"] | None = None
     reflectances: Float[Tensor, "B 6 H W"] | None = None
 
-    def mirrored(self) -> "Hints":
-        """Return the hints of the scans' mirror images, left and right exchanged."""
+    def mirrored(self) -> "ClassicalFeatures":
+        """Return the classical features of the scans' mirror images, left and right exchanged."""
         maps = [_LEFT_RIGHT.get(index, index) for index in range(NUM_MAPS)]
         candidates = [_LEFT_RIGHT_CANDIDATES.get(index, index) for index in range(NUM_CANDIDATES)]
         labels = None if self.labels is None else self.labels[:, _LEFT_RIGHT_LABELS].flip(-1)
         bright = None if self.reflectances is None else self.reflectances[:, _LEFT_RIGHT_REFLECTANCES].flip(-1)
-        return Hints(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels, bright)
+        return ClassicalFeatures(self.maps[:, maps].flip(-1), self.candidates[:, candidates].flip(-1), labels, bright)
 
 
-def hints_of(condition: Observed, device: torch.device | None = None) -> Hints:
-    """Return the hints of a batch of scans, on a device; on that of the condition if none is given."""
+def classical_features(condition: Observed, device: torch.device | None = None) -> ClassicalFeatures:
+    """Return the classical features of a batch of scans, on a device; on that of the condition if none is given."""
     device, dtype = condition.range_m.device if device is None else device, condition.range_m.dtype
     every = [SeenScan.of(condition, index) for index in range(len(condition))]
     next_returns = [[_next_return(seen, *side) for side in _SIDES] for seen in every]
@@ -74,7 +74,7 @@ def hints_of(condition: Observed, device: torch.device | None = None) -> Hints:
     of_labels, of_reflectance = (
         torch.from_numpy(np.stack(found)).to(device) if found else None for found in (labels, reflectances)
     )
-    return Hints(maps, candidates, of_labels, of_reflectance)
+    return ClassicalFeatures(maps, candidates, of_labels, of_reflectance)
 
 
 class _NextReturn(NamedTuple):

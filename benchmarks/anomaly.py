@@ -1,6 +1,6 @@
 """How well bits tell what does not belong in a scan: simulated scans, changed in known pixels → areas under ROC curves.
 
-    python benchmarks/surprise.py --scans simulated:24:test --json surprise.json
+    python benchmarks/anomaly.py --scans simulated:24:test --json anomaly.json
 
 Each scan is changed in five ways: a block that lies askew in the street, put in by the simulator where the scans are
 simulated; a ball that floats; dirt on the window; rain-like returns; and a sensor turned about its lateral axis. The
@@ -144,7 +144,7 @@ def scores(generator: Generator, diffusion: R2dm | None, image: RangeImage) -> d
     tokens = bits.tokens.repeat_interleave(CELL, 1).repeat_interleave(CELL, 2)
     return {
         "bits of tokens": tokens,
-        "bits of pixels beyond those expected": bits.surprise(),
+        "bits of pixels beyond those expected": bits.anomaly(),
         "all bits": bits.per_pixel(),
         "error of reconstruction": error + missed,
         **({} if diffusion is None else {"residual of R2DM": residual(diffusion, image)}),
