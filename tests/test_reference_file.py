@@ -218,7 +218,5 @@ def test_fewer_samples_and_samples_of_other_rays_are_refused(path, tmp_path):
             compare_sources(str(tmp_path / name), str(path), SETTINGS)
     (tmp_path / "r2dm").mkdir()
     torch.save(torch.ones(5, 64, 1024), tmp_path / "r2dm" / "samples_0000000.pth")
-    with pytest.raises(
-        ConfigError, match=r"of hdl64e_kitti_360 \(64x1024\), and .* scans as .*; have a file made with"
-    ):
+    with pytest.raises(ConfigError, match=r"\(64x1024, column stride 1\), and .* scans as .*; have a file made with"):
         compare_sources(str(tmp_path / "r2dm"), str(path), dataclasses.replace(SETTINGS, data=DataConfig(workers=1)))

@@ -121,9 +121,13 @@ class ReferenceFile:
         samples = samples.cut(protocol.first_points) if protocol.first_points else samples
         first = Opened.of(samples, self.sensor, config)
         if not (sensor := first.images.sensor).same_rays(self.sensor):
-            ours, theirs = (f"{each.name} ({each.height}x{each.width})" for each in (sensor, self.sensor))
+            ours, theirs = (
+                f"{each.name} ({each.height}x{each.width}, column stride {each.column_stride})"
+                for each in (sensor, self.sensor)
+            )
             got = f"range images of {ours}, and {self.path} of scans as {theirs} sees them"
-            raise ConfigError(got, "the same rays", "have a file made with --sensor and --set data.columns of these")
+            cure = "have a file made with --sensor and --set data.columns data.column_stride of these"
+            raise ConfigError(got, "the same rays", cure)
         if len(first.images) < count:
             got = f"{counted_scans(len(first.images))} in {samples.text}, and a reference file of {count:,}"
             raise ConfigError(got, f"{count:,} samples or more", "sample more, or make a reference file with -n")
