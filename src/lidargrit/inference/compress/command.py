@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import CheckpointError, ScanError, UsageError, no_usable_scan
+from lidargrit.core.errors import CheckpointError, ConfigError, ScanError, UsageError, no_usable_scan
 from lidargrit.core.shares import each_done
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
