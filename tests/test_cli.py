@@ -384,6 +384,7 @@ def test_every_option_says_what_it_is():
             if action.dest == "debug":  # which the help of all verbs together explains
                 continue
             about = (verb.prog, action.dest, action.help)
+            assert action.dest != "device" or action.default == "", "every verb chooses the device by itself"
             assert action.help, about
             assert len(action.help.split()) >= 3, about
             assert not re.match(r"(of|for|that|as|in all|likewise|evenly|see)\b", action.help), about

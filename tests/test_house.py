@@ -47,6 +47,12 @@ def test_the_version_is_said_once():
     assert project["version"] == lidargrit.__version__ == newest[1]
 
 
+def test_the_oldest_torch_that_is_let_in_has_the_optimisers():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (least,) = [found[1] for each in project["dependencies"] if (found := re.match(r"torch>=([\d.]+)", each))]
+    assert tuple(map(int, least.split("."))) >= (2, 9), "torch.optim.Muon came with 2.9"
+
+
 def test_what_is_exported_is_there():
     assert sorted(lidargrit.__all__) == sorted(api.__all__)
     for name in lidargrit.__all__:
