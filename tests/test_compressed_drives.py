@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ScanError
+from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.windows import TimedScan
 from lidargrit.inference.compress.archive import Archive, add_scan, writing
@@ -106,6 +107,27 @@ def test_one_left_out_is_no_past_of_those_behind_it(drive, tmp_path):
 def test_without_poses_each_is_compressed_by_itself(drive, capsys):
     assert compress(drive, "without_poses", "alone.lgz", "-n", "2") == 0
     assert "2 scans have no time or no pose, such as velodyne/000000, and so no past" in capsys.readouterr().err
+
+
+def test_a_file_begun_by_other_poses_is_told(drive, tmp_path, monkeypatch, capsys):
+    whole, calls = ScanCodec.compress, []
+
+    def interrupted(self, image, past=None):
+        calls.append(image)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return whole(self, image, past)
+
+    monkeypatch.setattr(ScanCodec, "compress", interrupted)
+    shutil.copytree(drive / "drive", drive / "moved")
+    assert compress(drive, "moved", "moved.lgz") != 0
+    elsewhere = poses(COUNT)
+    elsewhere[:, 1, 3] = 0.01 * torch.arange(COUNT)
+    np.savetxt(drive / "moved" / "poses.txt", elsewhere[:, :3].flatten(1).numpy())
+    motions.cache_clear()
+    capsys.readouterr()
+    assert compress(drive, "moved", "moved.lgz") == 2
+    assert "which is none of these" in the_one_line(capsys.readouterr().err, "compress")
 
 
 def test_another_past_is_told(drive):

@@ -75,7 +75,7 @@ def compress_scans(
     check_names(source, names)  # of which a file has each once
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(compressor.codec, model, sensor), chosen) as writer:
-        missing = writer.missing([inputs.identity(index) for index in range(len(inputs))])
+        missing = writer.missing([compressor.identity(index) for index in range(len(inputs))])
         do = partial(_write_some, work, writer.folder) if ray else partial(compressor.write, writer.folder)
         size = _SHARE_ON_RAY if ray else 1
         shares = [missing[first : first + size] for first in range(0, len(missing), size)]
@@ -116,6 +116,11 @@ class _Compressor:
         reader = ScanReader(codec.sensor, projection_variant(locate(work.model)), projection=config.projection)
         return cls(codec, open_inputs(work.source, reader, config), config.bad_scans == "skip")
 
+    def identity(self, index: int) -> str:
+        """Return what identifies a scan; of a drive its place, too, by which those behind it are compressed."""
+        named = self.inputs.identity(index)
+        return named if self._drives is None else f"{named}, placed at {self._drives.place(index, 0)[1:]}"
+
     def write(self, folder: Path, indices: Sequence[int]) -> int:
         for index in indices:
             data, returns, image = b"", 0, self._image(index)
@@ -131,7 +136,7 @@ class _Compressor:
                 if not self._told and (lost := _not_kept(image)):
                     self._told = True
                     reporting.message(f".lgz keeps no {lost}")
-            add_scan(folder, index, (self.inputs.name(index), self.inputs.identity(index), returns), data)
+            add_scan(folder, index, (self.inputs.name(index), self.identity(index), returns), data)
         return len(indices)
 
     def _read(self, index: int) -> RangeImage | ScanError:
