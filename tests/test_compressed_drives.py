@@ -24,7 +24,7 @@ from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.forecaster.system import Forecaster
-from tiny_runs import the_one_line
+from tiny_runs import the_one_line, with_random_weights
 
 pytest.importorskip("constriction")
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -33,11 +33,7 @@ STEP_MM, COUNT = 20, 4
 
 def made() -> Forecaster:
     """Return a forecaster of random weights, whose probabilities depend on the past."""
-    generator = Forecaster(Forecaster.smallest_config(SENSOR), SENSOR)
-    rng = torch.Generator().manual_seed(3)
-    for weight in generator.parameters():
-        weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
-    return generator.eval()
+    return with_random_weights(Forecaster(Forecaster.smallest_config(SENSOR), SENSOR)).eval()
 
 
 def scans(count: int) -> RangeImage:

@@ -26,7 +26,7 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit, LidarGritConfig, TokenSampling
 from lidargrit.systems.multiscale.system import Multiscale, MultiscaleConfig
-from tiny_runs import the_one_line
+from tiny_runs import the_one_line, with_random_weights
 
 pytest.importorskip("constriction")
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32)
@@ -38,11 +38,8 @@ PIXELS = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, ran
 
 def made(pixels: PixelDecoderConfig | None = PIXELS, seed: int = 3) -> LidarGrit:
     """Return a generator of random weights, whose probabilities differ from pixel to pixel."""
-    generator = LidarGrit(LidarGritConfig(TOKENIZER, TransformerConfig(layers=1, heads=2, width=16), pixels), SENSOR)
-    rng = torch.Generator().manual_seed(seed)
-    for weight in generator.parameters():
-        weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
-    return generator.eval()
+    config = LidarGritConfig(TOKENIZER, TransformerConfig(layers=1, heads=2, width=16), pixels)
+    return with_random_weights(LidarGrit(config, SENSOR), seed).eval()
 
 
 def scans(count: int) -> RangeImage:
@@ -73,10 +70,8 @@ def test_pixels_come_back_rounded_to_the_step(codec, compressed):
 
 @pytest.mark.parametrize("halvings", [{"column_halvings": 1}, {"row_halvings": 1}])
 def test_a_model_without_tokens_compresses_too(halvings):
-    generator = Multiscale(MultiscaleConfig(replace(PIXELS, coarsest_cell=4, **halvings)), SENSOR)
-    rng = torch.Generator().manual_seed(3)
-    for weight in generator.parameters():
-        weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
+    config = MultiscaleConfig(replace(PIXELS, coarsest_cell=4, **halvings))
+    generator = with_random_weights(Multiscale(config, SENSOR))
     codec, image = ScanCodec(generator, 20), generator.sample([0], sampling=PixelSampling(1.0, 1.0))
     compressed, bits = codec.compress(image[0]), float(generator.bits(image, 20).total())
     assert torch.equal(codec.decompress(compressed).range_m, codec.steps.round(image).range_m[0])

@@ -40,6 +40,7 @@ from lidargrit.systems.lidargrit.system import (
 )
 from lidargrit.systems.maskgit.system import MaskedSampling, MaskGit, MaskGitConfig
 from lidargrit.training import train
+from tiny_runs import with_random_weights
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(512, stride=8)  # 64x64 pixels
 TOKENIZER = VqvaeConfig(
@@ -52,9 +53,7 @@ PIXELS = PixelDecoderConfig(mask_features=2, range_features=2, mask_width=4, ran
 def made(pixels: PixelDecoderConfig | None = PIXELS) -> LidarGrit:
     generator = LidarGrit(LidarGritConfig(TOKENIZER, TRANSFORMER, pixels), SENSOR).eval()
     for stage in generator.stages:  # the same weights with and without a pixel decoder, whose own begin at zero
-        rng = torch.Generator().manual_seed(3)
-        for weight in generator.get_submodule(stage).parameters():
-            weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
+        with_random_weights(generator.get_submodule(stage))
     return generator
 
 

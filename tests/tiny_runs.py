@@ -4,8 +4,10 @@ import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeVar
 
 import torch
+from torch import nn
 
 from lidargrit.generation.objective import Objective
 from lidargrit.scans.condition import Observed
@@ -45,6 +47,17 @@ PROGRESS = re.compile(
     r"The tokenizer, .* learn anew here|"
     r".*: no sensor is named, so "
 )
+
+
+NetworkT = TypeVar("NetworkT", bound=nn.Module)
+
+
+def with_random_weights(network: NetworkT, seed: int = 3) -> NetworkT:
+    """Draw all weights, also those that begin at zero, so that outputs differ from pixel to pixel."""
+    rng = torch.Generator().manual_seed(seed)
+    for weight in network.parameters():
+        weight.data = torch.empty_like(weight).normal_(std=0.1, generator=rng)
+    return network
 
 
 def train_words(folder: Path, *settings: str) -> list[str]:
