@@ -178,6 +178,14 @@ def test_the_verb_writes_a_label_for_every_point_and_goes_on(run, tmp_path, caps
     assert any(f'"{CLASSES[int(n)].name}"' in page.read_text() for n in np.unique(np.fromfile(labels[0], "<u4")) if n)
 
 
+def test_the_sensor_that_a_run_learned_from_may_be_named_with_all_its_columns(run, tmp_path, capsys):
+    words = ["segment", "simulated:1:test", str(tmp_path / "out"), "--model", str(run / "whole"), "--device", "cpu"]
+    assert main([*words, "--sensor", "hdl64e_kitti_odometry"]) == 0
+    assert main([*words, "--sensor", "pandar64"]) == 2
+    assert main([*words, "--set", "data.columns=128"]) == 2
+    assert "64x128, for --model" in capsys.readouterr().err
+
+
 def test_scores_are_those_of_a_loop():
     rng = torch.Generator().manual_seed(0)
     numbers = torch.tensor(sorted(CLASSES))

@@ -22,12 +22,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from lidargrit.core import reporting
-    from lidargrit.training import check_folder, measure, plan_training, train
+    from lidargrit.training import check_folder, measure, plan_training, train, with_best_batches, without_auto
     from lidargrit.training.compute import duration
     from lidargrit.training.fine_tuning import fine_tuning_preset
 
     reporting.message("looking at the scans")
-    preset = fine_tuning_preset(options.scans, options.sensor, scan_words(options), options.val)
+    words, automatic = without_auto(scan_words(options))
+    preset = fine_tuning_preset(options.scans, options.sensor, words, options.val)
+    preset = with_best_batches(preset, automatic, options.out)
     check_folder(options.out, preset)
     plan = plan_training(preset)
     said = ", ".join(f"{stage} {preset.settings_of(stage).scans:,}" for stage in plan.flops)

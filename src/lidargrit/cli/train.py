@@ -32,9 +32,10 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.errors import ConfigError
     from lidargrit.generation.generator import load_class
     from lidargrit.generation.presets import load_preset
-    from lidargrit.training import measure, open_data, plan_training, train
+    from lidargrit.training import measure, open_data, plan_training, train, with_best_batches, without_auto
 
-    preset = load_preset(options.preset, scan_words(options))
+    words, automatic = without_auto(scan_words(options))
+    preset = with_best_batches(load_preset(options.preset, words), automatic, options.out)
     if options.dry_run or options.measure:
         refuse_taken(options)
         planned = plan_training(preset)

@@ -73,6 +73,10 @@ def numbers_at_most(
             hook.remove()
 
 
+class TooLargeError(ConfigError):
+    """More than a GPU's memory holds was to be computed at once."""
+
+
 @contextmanager
 def within_memory(scans: int, cure: str) -> Iterator[None]:
     """Tell in one line that a GPU has no memory for what is computed within the ``with`` block.
@@ -88,4 +92,4 @@ def within_memory(scans: int, cure: str) -> Iterator[None]:
     except torch.OutOfMemoryError as error:
         torch.cuda.empty_cache()
         reason = str(error).partition(". ")[0]
-        raise ConfigError(f"{scans} scans at once ({reason})", "what the GPU's memory holds", cure) from None
+        raise TooLargeError(f"{scans} scans at once ({reason})", "what the GPU's memory holds", cure) from None

@@ -30,11 +30,17 @@ def sensor_for_run(settings: ScanSettings, scans: str, model: str, job: Job = "s
 
 
 def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample") -> None:
-    """Refuse a sensor or columns that are not a run's own, which its networks know alone."""
+    """Refuse a sensor or columns that are not a run's own, which its networks know alone.
+
+    Where no columns are set, those of the run are meant: scans of its sensor have all of them.
+    """
     if not (settings.sensor or settings.data.columns):
         return
     own = RunSource(model, locate(model, job)).sensor
     sensor = settings.load_sensor() or settings.data.with_projection(own.fine())
+    has_columns = sensor.elevation_rad.shape[1] == 1 and sensor.azimuth_rad.shape[0] == 1
+    if not settings.data.columns and sensor.name == own.name and has_columns:
+        sensor = sensor.with_columns(own.width * own.column_stride, own.column_stride)
     if not own.same_rays(sensor):
         raise other_sensor(sensor, own, model, settings.sensor)
 

@@ -234,5 +234,6 @@ class _Labels:
 def _own_labels(scan: Scan, numbering: str) -> Int[Tensor, " n"]:
     """Return the labels that a scan came with, by SemanticKITTI's numbers."""
     if scan.label is None:
-        raise DataError(f"no labels in {scan.source}", "labels to compare with", "leave --compare out")
+        cure = "name the tree that has them, as kitti_odometry:ROOT:00, or leave --compare out"
+        raise DataError(f"no labels in {scan.source}", "labels to compare with", cure)
     return as_semantic_kitti(scan.label & CLASS_BITS, numbering)
