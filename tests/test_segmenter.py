@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import torch
 
+import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
+from lidargrit.data import formats
 from lidargrit.data.scan_folder import KittiTree
 from lidargrit.evaluation.metrics.shared.labelled import segmenter_of
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
-from lidargrit.inference.segment.command import GROUPS, LabelScores, labels_of_points
+from lidargrit.inference.segment.command import GROUPS, LabelScores
+from lidargrit.inference.segment.points import labels_of_points
 from lidargrit.scans.classes import CLASSES
 from lidargrit.scans.example import Example
 from lidargrit.scans.projection import index_map, project
@@ -168,6 +171,11 @@ def test_the_verb_writes_a_label_for_every_point_and_goes_on(run, tmp_path, caps
         )
         scores.add(found, true & 0xFFFF)
     assert json.loads((tmp_path / "found.json").read_text())["mean"] == scores.mean()
+    scan = formats.read_scan(tmp_path / "in/sequences/00/velodyne/000000.bin")
+    by_function = lidargrit.segment(scan, str(run / "whole"))
+    assert by_function.label is not None
+    assert np.array_equal(by_function.label, np.fromfile(labels[0], "<u4"))
+    assert torch.equal(by_function.points_xyz_m, scan.points_xyz_m)
     before = labels[0].read_bytes()
     labels[0].unlink()
     (tmp_path / "out/sequences/00/velodyne/000000.bin").unlink()

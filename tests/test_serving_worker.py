@@ -13,9 +13,10 @@ import lidargrit
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import load, read_scan
 from lidargrit.inference.complete.inputs import ScanReader
-from lidargrit.scans.types import Scan
+from lidargrit.inference.segment import label_images, open_segmenter
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.viewer.serve.requests import TASKS, SampleRequest
-from lidargrit.viewer.serve.worker import PIXELS_FILE, compute_result, describe_model, run_worker
+from lidargrit.viewer.serve.worker import PAGE_FILE, PIXELS_FILE, compute_result, describe_model, run_worker
 from test_generator_contract import made
 
 
@@ -79,7 +80,7 @@ def part_file(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if task != "returns"])
+@pytest.mark.parametrize("task", [task for task in TASKS if task not in ("returns", "label")])
 def test_a_part_of_the_circle_is_taken_only_where_lost_returns_are_completed(task, part_file):
     # elsewhere rays outside of it would count as observed, and lost
     with pytest.raises(ScanError, match=r"degrees of azimuth in mine\.ply|rings in mine\.ply"):
@@ -122,3 +123,22 @@ def test_messages_of_tasks_name_no_option_of_the_command_line(tmp_path):
     with pytest.raises(ScanError, match=r"^got mine\.ply without a return outside the part to fill in") as refused:
         compute_result(made("lidargrit")[0], request)
     assert "--" not in str(refused.value)
+
+
+def test_a_scan_is_labelled_by_the_segmenter_beside_a_model(scan_file, tmp_path, monkeypatch):
+    request = {"model": 0, "task": "label", "file": str(scan_file), "name": "mine.ply"}
+    monkeypatch.setattr("sys.stdin", StringIO(json.dumps({"request": request, "folder": str(tmp_path)})))
+    monkeypatch.setattr("sys.stdout", answers := StringIO())
+    run_worker([Path("pretrained")], "cpu")
+    described, answered = map(json.loads, answers.getvalue().splitlines())
+    assert "label" in described["models"][0]["tasks"]
+    assert answered == {"done": True}
+    pixels, scan = np.load(tmp_path / PIXELS_FILE), read_scan(scan_file, bad_points="drop")
+    segmenter = open_segmenter("pretrained", "cpu")
+    seen = ScanReader(segmenter.sensor, partial=True).read(scan)
+    wanted = label_images(segmenter, RangeImage.stack([seen.image]))
+    assert np.array_equal(pixels["label_0"], wanted.label)
+    page = json.loads((tmp_path / PAGE_FILE).read_text())
+    assert [source["name"] for source in page["sources"]] == ["labelled"]
+    assert {"road", "car"} <= {one["name"] for one in page["sources"][0]["classes"]}
+    assert "label" not in describe_model("tiny", made("lidargrit")[0])["tasks"]

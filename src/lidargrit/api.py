@@ -1,6 +1,7 @@
 """What ``import lidargrit`` offers, in one place."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
@@ -21,6 +22,8 @@ from lidargrit.generation.generator import load
 from lidargrit.inference.complete import Model, open_model
 from lidargrit.inference.complete.cloud import CompletedScan
 from lidargrit.inference.complete.tasks import AddRows, Drop, complete_scan
+from lidargrit.inference.segment import open_segmenter
+from lidargrit.inference.segment.points import PointLabels
 from lidargrit.scans.condition import ConditionKind, Observed
 from lidargrit.scans.projection import inspect, unproject
 from lidargrit.scans.projection import project as project_scan
@@ -28,6 +31,7 @@ from lidargrit.scans.projection.image import ProjectionVariant
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
+from lidargrit.systems.segmenter.system import Segmenter
 
 __all__ = [
     "Observed",
@@ -41,6 +45,7 @@ __all__ = [
     "open_model",
     "project",
     "raydrop",
+    "segment",
     "simulate",
     "torch_dataset",
     "unproject",
@@ -139,6 +144,35 @@ def raydrop(points: Points, model: str | Model = "pretrained", seed: int = 0) ->
         kept = lidargrit.raydrop(points).kept.numpy()
     """
     return complete_scan(_as_scan(points), _opened(model, "surfaces"), Drop(), seed)
+
+
+def segment(points: Points, model: str | Segmenter = "pretrained") -> Scan:
+    """Label every point of a scan with its class, by SemanticKITTI's numbers.
+
+    Args:
+        points: scan, or its points as an array (n, 3), or (n, 4) with intensity, in metres.
+        model: run of a segmenter, or what :func:`load` returned for it; load a run once for many scans.
+
+    Returns:
+        the scan with all its points, in their order, and their labels; 0 for points without a return of the range image
+        nearby.
+
+    Raises:
+        ScanError: points that cannot be used, or of another sensor than the segmenter's.
+
+    Example::
+
+        is_car = lidargrit.segment(points).label == 10
+    """
+    scan = _as_scan(points)
+    segmenter = _packaged_segmenter() if model == PACKAGED[0].name else model
+    labels = PointLabels(segmenter if isinstance(segmenter, Segmenter) else open_segmenter(segmenter))
+    return replace(scan, label=labels.of(scan)[0])
+
+
+@lru_cache
+def _packaged_segmenter() -> Segmenter:
+    return open_segmenter(PACKAGED[0].name)
 
 
 def evaluate(

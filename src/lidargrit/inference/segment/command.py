@@ -4,9 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
 import torch
-from jaxtyping import Float64, Int, Int64
+from jaxtyping import Float64, Int
 from torch import Tensor
 
 from lidargrit.core import reporting
@@ -17,59 +16,12 @@ from lidargrit.data.run_folder import locate, weights_sha256
 from lidargrit.data.scan_folder import KittiTree, ScanFolder, write_with_labels
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
-from lidargrit.inference.complete.inputs import ScanReader
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
+from lidargrit.inference.segment.points import PointLabels
 from lidargrit.scans.classes import CLASS_BITS, CLASSES, Group, as_semantic_kitti
-from lidargrit.scans.projection.pixel_coordinates import PixelCoordinates
 from lidargrit.scans.sensors import ProjectionOption
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
-
-_WINDOWS = ((1, 2), (3, 8))  # rows and columns around a point's pixel: the second where the first has no return
-
-
-def labels_of_points(
-    image: RangeImage, point_of_pixel: Int64[Tensor, "H W"], at: PixelCoordinates
-) -> Int[Tensor, " n"]:
-    """Return a label for every point.
-
-    A point that fills a pixel has its label. Any other lies behind a nearer point of its pixel, beyond the sensor's
-    limits, or above or below all rows: of the returns around its pixel (three rows and five columns; seven and 17
-    where there is none) that one gives the label whose range is nearest to the point's. Where none returned, the
-    label is 0.
-
-    Args:
-        image: labelled range image (H, W) of the scan.
-        point_of_pixel: index of the point that fills each pixel, -1 for none.
-        at: row, column and range of every point.
-
-    Source:
-        Milioto et al., RangeNet++, IROS 2019, section III-D, with one neighbour in place of five.
-    """
-    assert image.label is not None
-    label_of_pixel, range_m = image.label.numpy(), image.range_m.numpy()
-    label = np.zeros(len(at.range_m), np.int64)
-    filled = point_of_pixel.numpy()
-    label[filled[filled >= 0]] = label_of_pixel[filled >= 0]
-    without = np.ones(len(label), bool)
-    without[filled[filled >= 0]] = False
-    height, width = range_m.shape
-    for rows, columns in _WINDOWS:
-        left = np.flatnonzero(without)
-        down, right = (each.ravel() for each in np.mgrid[-rows : rows + 1, -columns : columns + 1])
-        row = np.clip(at.row[left].astype(np.int64), 0, height - 1)[:, None] + down
-        column = (at.column[left].astype(np.int64)[:, None] + right) % width
-        inside = (row >= 0) & (row < height)
-        row = np.clip(row, 0, height - 1)
-        apart_m = np.abs(range_m[row, column] - at.range_m[left][:, None])
-        apart_m[~inside | (range_m[row, column] == 0)] = np.inf
-        nearest = apart_m.argmin(1)
-        found = np.isfinite(apart_m[np.arange(len(left)), nearest])
-        pixel = row[np.arange(len(left)), nearest], column[np.arange(len(left)), nearest]
-        label[left[found]] = label_of_pixel[pixel][found]
-        without[left[found]] = False
-    return torch.from_numpy(label)
-
 
 GROUPS = tuple(group for group in get_args(Group) if group)
 _GROUP_OF = torch.zeros(max(CLASSES) + 1, dtype=torch.int64)
@@ -125,9 +77,6 @@ class LabelScores:
 
 
 MANIFEST = "segmented.json"
-_FEW_RINGS_CURE = (
-    "name a segmenter of the scans' sensor with --model, or train one: lidargrit train segmenter_compact RUN"
-)
 
 
 def segment_scans(
@@ -194,7 +143,7 @@ def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans
 
 
 class _Labels:
-    """The label that a segmenter finds for every point of a scan.
+    """The label that a segmenter finds for every point of a scan; what makes them doubtful is told once.
 
     Args:
         scans: scans of the source.
@@ -204,22 +153,17 @@ class _Labels:
 
     def __init__(self, scans: NamedScans, segmenter: Segmenter, projection: ProjectionOption) -> None:
         self._scans, self._segmenter = scans, segmenter
-        self._reader, self._told = (
-            ScanReader(segmenter.sensor.fine(), "exact", True, projection, _FEW_RINGS_CURE),
-            set[str](),
-        )
+        self._points = PointLabels(segmenter, projection)
+        self._told = set[str]()
 
     def of(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
         if isinstance(self._scans, ImageScans):
             image = label_images(self._segmenter, RangeImage.stack([self._scans.image(index)]))
             assert image.label is not None
             return image.label[image.return_mask]
-        read = self._reader.read(scan)
-        assert read.point_of_pixel is not None
-        image = label_images(self._segmenter, RangeImage.stack([read.image]))[0]
-        label = labels_of_points(image, read.point_of_pixel, read.coordinates)
-        if read.doubt:
-            self._tell("doubt", f"WARNING: {read.doubt}")
+        label, doubt = self._points.of(scan)
+        if doubt:
+            self._tell("doubt", f"WARNING: {doubt}")
         if unlabelled := int((label == 0).sum()):
             what = f"{unlabelled:,} of {len(scan):,} points have no return of the image nearby, and the label 0"
             self._tell("unlabelled", f"{scan.source}: {what}; so may points of further scans")

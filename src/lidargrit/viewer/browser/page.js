@@ -65,6 +65,11 @@ class Page {
     }
   }
 
+  colourBy(mode) {
+    this.chosen = true;
+    this.control.mode.value = mode;
+  }
+
   listen() {
     const { previous, next, position, mode, dropped, size, light, reset } = this.control;
     previous.addEventListener("click", () => this.step(-1));

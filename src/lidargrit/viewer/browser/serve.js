@@ -269,10 +269,14 @@ class Desk {
         completed: `completed by ${by}`,
         "with raydrop": `raydrop by ${by}`,
         reconstructed: `reconstructed by ${by}`,
+        labelled: `labelled by ${by}`,
       }[source.name];
       const shown = Object.assign(new Source(source), { name: name ?? source.name });
       return new ServedPane(shown, this.page, job, group, data.scales);
     });
+    if (data.sources.some((source) => source.name === "labelled")) {
+      this.page.colourBy("label");
+    }
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
     fresh.at(-1).element.scrollIntoView({ block: "nearest" }); // on a small screen the form lies below
   }

@@ -22,6 +22,7 @@ TASKS = {  # what a model makes of a scan → the words of its button on the pag
     "rows": "Fill three rows of four",
     **{sensor: f"Add the rows that {name} lacks" for sensor, name in UPSAMPLED.items()},
     "raydrop": "Drop rays of a clean scan",
+    "label": "Name the class of each point",
 }
 _SECONDS_AT_MOST = 86_400
 

@@ -12,7 +12,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from lidargrit.generation.generator import Generator, load
 from lidargrit.inference.complete.inputs import InputScan, ScanReader
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.inference.complete.sparse import SparseReader, observed_rows
+from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.projection import ProjectionVariant
@@ -36,6 +37,7 @@ from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.setups import setup_of
+from lidargrit.systems.segmenter.system import Segmenter
 from lidargrit.viewer.interactive import page_data
 from lidargrit.viewer.scan_sets import ScanSet
 from lidargrit.viewer.serve.requests import EXAMPLES, TASKS, UPSAMPLED, Example, SampleRequest, sampling_settings
@@ -66,33 +68,45 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
         return
     names = [run.resolve().name for run in runs]
     names = [name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)]
-    models = [describe_model(name, model) for name, (model, _) in zip(names, loaded, strict=True)]
+    models = [describe_model(name, one.generator, one.segmenter) for name, one in zip(names, loaded, strict=True)]
     _send(answers, {"models": models})
     for line in sys.stdin:
         message = json.loads(line)
         request = SampleRequest(**message["request"])
-        generator, variant = loaded[request.model]
-        _send(answers, _answer_request(generator, variant, request, Path(message["folder"])))
+        _send(answers, _answer_request(loaded[request.model], request, Path(message["folder"])))
 
 
-def _load(run: Path, device: torch.device) -> tuple[Generator, ProjectionVariant]:
+class _Served(NamedTuple):
+    """What is read of a run: its generator, the projection of its scans, and the segmenter beside it, if any."""
+
+    generator: Generator
+    variant: ProjectionVariant
+    segmenter: Segmenter | None
+
+
+def _load(run: Path, device: torch.device) -> _Served:
     try:
-        return load(run).to(device), projection_variant(locate(run))
+        generator, segmenter = load(run).to(device), None
+        if locate(run, "segment") != locate(run):
+            segmenter = open_segmenter(str(run), str(device))
+            segmenter = segmenter if can_label(segmenter.sensor, generator.sensor) else None
+        return _Served(generator, projection_variant(locate(run)), segmenter)
     except LidarGritError as error:
         if str(run) in error.got:
             raise
         raise type(error)(f"{run}: {error.got}", error.wanted, error.cure) from None
 
 
-def describe_model(name: str, generator: Generator) -> dict[str, Any]:
+def describe_model(name: str, generator: Generator, segmenter: Segmenter | None = None) -> dict[str, Any]:
     """Return the facts of a model that the page needs."""
     sensor = generator.sensor
+    tasks = [task for task in TASKS if _can(generator, task)] + ["label"] * (segmenter is not None)
     return {
         "name": name,
         "generator": generator.public_name(),
         "sensor": f"{sensor.name}, {sensor.height} x {sensor.width}",
         "upload": next((able for able in ("complete", "encode") if able in generator.capabilities), ""),
-        "tasks": [task for task in TASKS if _can(generator, task)],
+        "tasks": tasks,
         "settings": _settings_of(generator),
         "rays": sensor.to_json(),
     }
@@ -100,7 +114,7 @@ def describe_model(name: str, generator: Generator) -> dict[str, Any]:
 
 def _can(generator: Generator, task: str) -> bool:
     """Return whether a model can do a task: one of upsampling wants rows between those of the other sensor."""
-    if "complete" not in generator.capabilities:
+    if "complete" not in generator.capabilities or task == "label":
         return False
     if task in UPSAMPLED:
         try:
@@ -124,8 +138,13 @@ def _settings_of(generator: Generator) -> list[dict[str, Any]]:
     return settings
 
 
-def compute_result(generator: Generator, request: SampleRequest, variant: ProjectionVariant = "exact") -> list[ScanSet]:
-    """Sample new scans, or complete, upsample, drop or reconstruct a scan that is uploaded or an example."""
+def compute_result(
+    generator: Generator,
+    request: SampleRequest,
+    variant: ProjectionVariant = "exact",
+    segmenter: Segmenter | None = None,
+) -> list[ScanSet]:
+    """Sample new scans, or complete, upsample, drop, label or reconstruct a scan that is uploaded or an example."""
     # Settings that the client left alone stay with the generator: it may complete by other values than it samples by.
     own = generator.completion_sampling() if request.has_scan else generator.Sampling()
     sampling = dataclasses.replace(own, **request.sampling) if request.sampling else None
@@ -136,6 +155,8 @@ def compute_result(generator: Generator, request: SampleRequest, variant: Projec
         return [ScanSet("generated", new, names, generated=True)]
     seen = _read_scan(request, generator, _reader(request, generator, variant))
     image = RangeImage.stack([seen.image])
+    if request.task == "label" and segmenter is not None:
+        return [ScanSet("labelled", label_images(segmenter, image), (request.name,))]
     measured = torch.zeros_like(image.return_mask)  # nothing in it was filled
     sets = [ScanSet("example" if request.example else "as uploaded", image, (request.name,), filled=measured)]
     if "complete" not in generator.capabilities:
@@ -161,7 +182,7 @@ def _reader(request: SampleRequest, generator: Generator, variant: ProjectionVar
     completes = "complete" in generator.capabilities  # a model that does not has no task
     if completes and request.task in UPSAMPLED:
         return SparseReader(generator.sensor, variant, source=load_sensor(request.task))
-    return ScanReader(generator.sensor, variant, partial=completes and request.task == "returns")
+    return ScanReader(generator.sensor, variant, partial=completes and request.task in ("returns", "label"))
 
 
 def _read_scan(request: SampleRequest, generator: Generator, reader: ScanReader) -> InputScan:
@@ -231,11 +252,9 @@ def _observed(request: SampleRequest, seen: InputScan) -> Bool[Tensor, "H W"]:
     raise ScanError(got, wanted, "choose another task, or another scan")
 
 
-def _answer_request(
-    generator: Generator, variant: ProjectionVariant, request: SampleRequest, folder: Path
-) -> dict[str, Any]:
+def _answer_request(model: _Served, request: SampleRequest, folder: Path) -> dict[str, Any]:
     try:
-        sets = compute_result(generator, request, variant)
+        sets = compute_result(model.generator, request, model.variant, model.segmenter)
         pixels: dict[str, Any] = {}
         for index, scans in enumerate(sets):
             pixels[f"range_m_{index}"] = scans.images.range_m.numpy()
