@@ -5,7 +5,6 @@ import gzip
 import json
 import re
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +14,6 @@ import torch
 from browser import Browser
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
-from lidargrit.data.datasets.shared.odometry import motions
-from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.formats import read_scan
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.scans.projection import unproject
@@ -145,21 +142,6 @@ def test_scans_that_cannot_be_used_are_refused_or_left_out(tmp_path):
     assert scan_sets._short(f"/data/{'x' * 30}/other_sensors/vlp16") == ".../other_sensors/vlp16"
 
 
-def test_times_of_a_drive_are_on_the_page(tmp_path, heard):
-    write_drives(tmp_path, 3, DriveConfig(SENSOR, seed=2_000_001, frames=3))
-    settings = ScanSettings(DataConfig(columns=256, column_stride=1))
-    (one,) = load_scan_sets([f"kitti_odometry:{tmp_path}"], 2, settings=settings)
-    assert one.times_s == (0.0, 0.1)
-    (later,) = load_scan_sets([f"kitti_odometry:{tmp_path}:00[34%:]"], 2, settings=settings)
-    assert [scan["time"] for scan in page_data(page([later]))["sources"][0]["scans"]] == [0, 0.1]
-    (tmp_path / "sequences" / "00" / "times.txt").write_text("noon\n")
-    motions.cache_clear()
-    (none,) = load_scan_sets([f"kitti_odometry:{tmp_path}"], 2, settings=settings)
-    assert none.times_s == ()
-    assert any("times are not known: got a row of" in line for line in heard)
-    assert "time" not in page_data(page([none]))["sources"][0]["scans"][0]
-
-
 def test_the_command_writes_a_page(tmp_path, capsys):
     out = tmp_path / "view.html"
     assert main(["view", "simulated:2:val", "-o", str(out), "-n", "2"]) == 0
@@ -240,37 +222,6 @@ def test_keys_and_buttons_step_through_the_scans(opened):
         "the slider has its own arrows"
     )
     assert (opened.screenshot(".cloud") == first).all()
-
-
-def test_a_drive_is_played_at_its_times_until_somebody_steps(browser, shown, tmp_path):
-    (drive, other) = (replace(one, images=one.images[:2], scan_names=one.scan_names[:2]) for one in shown)
-    write_page([other, replace(drive, times_s=(7.0, 7.3))], tmp_path / "drive.html")
-    browser.open(tmp_path / "drive.html")
-    browser.run(
-        "globalThis.seen = []; new MutationObserver(() => seen.push([counter.textContent, performance.now()]))"
-        ".observe(globalThis.counter = document.querySelector('#counter'), { childList: true })"
-    )
-    browser.click("#play")
-    until = time.monotonic() + 30
-    while browser.run("seen.length") < 4 and time.monotonic() < until:
-        time.sleep(0.1)
-    assert browser.run("document.querySelector('#play').textContent") == "Pause"
-    browser.press("ArrowLeft")
-    count = browser.run("seen.length")
-    time.sleep(1.5)
-    assert browser.run("seen.length") == count
-    assert browser.run("document.querySelector('#play').textContent") == "Play"
-    words, at_ms = zip(*browser.run("seen"), strict=True)
-    assert words[:4] == ("Scan 2 of 2", "Scan 1 of 2") * 2
-    assert at_ms[1] - at_ms[0] >= 900, "a drive begins anew after a second"
-    assert 290 <= at_ms[2] - at_ms[1] < at_ms[1] - at_ms[0] + 1500
-    assert browser.troubles() == []
-
-
-def test_scans_of_no_drive_cannot_be_played(opened):
-    assert opened.run("document.querySelector('#play').hidden")
-    opened.press("p")
-    assert opened.run("document.querySelector('#counter').textContent") == "Scan 1 of 3"
 
 
 def test_one_camera_turns_all_views(opened):
