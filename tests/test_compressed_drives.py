@@ -105,6 +105,22 @@ def test_without_poses_each_is_compressed_by_itself(drive, capsys):
     assert "2 scans have no time or no pose, such as velodyne/000000, and so no past" in capsys.readouterr().err
 
 
+def test_a_drive_compressed_by_another_model_of_a_bundle_is_told_of_the_smaller_file(drive, tmp_path, capsys):
+    bundle = drive / "bundle"
+    for name in ("single", "drives"):
+        shutil.copytree(drive / "run", bundle / name)
+    (bundle / "bundle.json").write_text('{"sample": "single", "drive": "drives"}')
+    hint = f"4 scans have times and poses: --model {bundle}/drives makes the file smaller"
+    for source, model, told in (
+        ("drive", bundle, True),
+        ("drive", bundle / "single", False),
+        ("without_poses", bundle, False),
+    ):
+        words = ["--model", str(model), "--step-mm", str(STEP_MM), "--projection", "spherical", "--overwrite"]
+        assert main(["compress", str(drive / source), str(tmp_path / "a.lgz"), *words]) == 0
+        assert (hint in capsys.readouterr().err) == told
+
+
 def test_a_file_begun_by_other_poses_is_told(drive, tmp_path, monkeypatch, capsys):
     whole, calls = ScanCodec.compress, []
 

@@ -166,7 +166,8 @@ def tiny_run(tmp_path_factory):
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys):
+def test_examples_run_and_draw_what_is_shown(path, tiny_run, tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(path.parent)  # as Python itself does for a program, which may use another one
     module = _program(path)
     for name in {"STEPS", "COUNT"} & vars(module).keys():
         setattr(module, name, 3)  # what is shown takes seconds more

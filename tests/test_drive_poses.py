@@ -156,6 +156,18 @@ def test_poses_without_a_calibration_are_the_sensors_own(tmp_path):
     assert torch.equal(known.pose, torch.eye(4).double())
 
 
+def test_poses_of_tums_form_beside_scans_are_told_once(tmp_path, heard):
+    for number in range(2):
+        scan_file(tmp_path / "scans" / f"{number:06d}.bin")
+    (tmp_path / "poses.txt").write_text("# time x y z qx qy qz qw\n0 0 0 0 0 0 0 1\n0.1 5 0 0 0 0 0 1\n")
+    scans = open_dataset(str(tmp_path))
+    assert [scans.motion(index).pose for index in range(2)] == [None, None]
+    assert heard == [
+        f"{tmp_path / 'poses.txt'} has poses in TUM's form, which are not taken as those of scans: "
+        "KITTI's 12 numbers in a row for each scan would be; export --undo-motion takes it as it is"
+    ]
+
+
 def test_damaged_timestamps_are_refused(tmp_path):
     scan_file(tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "data" / "0000000000.bin")
     (tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps.txt").write_text("noon\n")

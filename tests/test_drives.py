@@ -10,6 +10,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, OutputError
+from lidargrit.data import drives
 from lidargrit.data.datasets import data_set_and_split, open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.export import export_scans
@@ -28,6 +29,27 @@ def drive(tmp_path_factory):
 
 def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_what_an_interrupted_simulation_leaves_are_drives(tmp_path, monkeypatch):
+    config = DriveConfig(SENSOR, seed=8, frames=3)
+
+    def stopped(do, shares, *others):
+        do(shares[0][:2])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(drives, "each_done", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            write_drives(tmp_path, 5, config)
+    (window,) = open_dataset(f"kitti_odometry:{tmp_path}").windows(2)
+    write_drives(tmp_path, 5, config)
+    assert [float(scan.pose[0, 3]) for scan in window.scans()] == [
+        float(open_dataset(f"kitti_odometry:{tmp_path}").motion(index).pose[0, 3]) for index in range(2)
+    ]
+    assert len((tmp_path / "sequences" / "01" / "poses.txt").read_text().splitlines()) == 2
+    write_drives(tmp_path, 6, config)  # one scan more of the second street
+    assert len((tmp_path / "sequences" / "01" / "poses.txt").read_text().splitlines()) == 3
 
 
 def test_its_scans_are_not_those_of_kitti(drive, tmp_path):

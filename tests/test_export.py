@@ -19,6 +19,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.scan_folder import KittiTree
 from lidargrit.data.sources import open_images
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
 from tiny_runs import contents
@@ -326,3 +327,73 @@ def test_the_command(samples, tmp_path, capsys):
 def test_labels_that_a_format_does_not_keep_are_told_once(streets, tmp_path, kind, told, heard):
     export_scans(streets, tmp_path, kind, DataConfig(max_scans=2))
     assert [text.partition(";")[0] for text in heard] == told
+
+
+def poses_of(source):
+    """Return names, times and poses of a source."""
+    scans = open_dataset(source).timed_scans()
+    poses = [scan.motion.pose.numpy() for scan in scans if scan.motion.pose is not None]
+    return [scan.name for scan in scans], np.array([scan.motion.time_s for scan in scans]), np.array(poses)
+
+
+@pytest.fixture
+def wandering(tmp_path):
+    """Return the folder of a drive of five scans numbered from 7, at times and places of a recording's own clock."""
+    folder = tmp_path / "drive" / "clouds"
+    folder.mkdir(parents=True)
+    step = np.array([[0.96, -0.28, 0, 0.7], [0.28, 0.96, 0, 0.1], [0, 0, 1, 0.02], [0, 0, 0, 1]])
+    pose = np.array([[0, -1.0, 0, 458_123.123456789], [1, 0, 0, 5_428_765.987654321], [0, 0, 1, 101.5], [0, 0, 0, 1]])
+    poses = [pose := pose @ step for _ in range(5)]
+    for number in range(7, 12):
+        np.full((20, 4), number / 16, dtype="<f4").tofile(folder / f"{number:06d}.bin")
+    rows = "".join(" ".join(map(repr, one[:3].ravel().tolist())) + "\n" for one in poses)
+    (tmp_path / "drive" / "poses.txt").write_text(rows)
+    (tmp_path / "drive" / "times.txt").write_text("".join(f"{1_538_444_123.4 + 0.1 * n:.7f}\n" for n in range(5)))
+    return tmp_path / "drive"
+
+
+def test_a_tree_keeps_the_times_and_poses_of_a_drive(wandering, tmp_path):
+    _, times_s, poses = poses_of(str(wandering))
+    assert (len(times_s), poses.shape) == (5, (5, 4, 4))
+    assert export_scans(str(wandering), tmp_path / "tree", "kitti_odometry") == 5
+    names, read_s, read = poses_of(f"kitti_odometry:{tmp_path / 'tree'}:00")
+    assert names == [f"00/{number:06d}" for number in range(5)]
+    assert np.abs(read_s - times_s).max() < 1e-6, "a double of seconds since 1970 has no more"
+    assert np.array_equal(read, poses)
+    # By hand: KITTI's rows are of a camera behind Tr, x to the right, y down, z ahead.
+    lines = (tmp_path / "tree" / "sequences" / "00" / "calib.txt").read_text().splitlines()
+    (tr,) = [np.array(line.split()[1:], float).reshape(3, 4) for line in lines if line.startswith("Tr:")]
+    assert np.array_equal(tr[:, :3] @ [1, 0, 0], [0, 0, 1])
+    rows = np.loadtxt(tmp_path / "tree" / "poses" / "00.txt").reshape(-1, 3, 4)
+    assert np.allclose(rows[2][:, 3], tr[:, :3] @ poses[2][:3, 3])
+
+
+def test_a_tree_of_some_scans_keeps_their_poses_and_a_later_one_of_all_adds_theirs(wandering, tmp_path):
+    export_scans(str(wandering), tmp_path / "all", "kitti_odometry")
+    source, some = f"kitti_odometry:{tmp_path / 'all'}:00", tmp_path / "some"
+    _, times_s, poses = poses_of(source)
+    export_scans(source, some, "kitti_odometry", DataConfig(max_scans=2))
+    names, read_s, read = poses_of(f"kitti_odometry:{some}:00")
+    assert names == ["00/000000", "00/000002"]
+    assert np.array_equal(read, poses[[0, 2]])
+    assert np.array_equal(read_s, times_s[[0, 2]])
+    (some / "sequences" / "00" / "times.txt").unlink()  # all files that name a time are written anew
+    for _ in range(2):  # of fewer again, nothing changes
+        export_scans(source, some, "kitti_odometry")
+        written = contents(some)
+        export_scans(source, some, "kitti_odometry", DataConfig(max_scans=2))
+        assert {**contents(some), MANIFEST: b""} == {**written, MANIFEST: b""}
+    assert len((some / "sequences" / "00" / "poses.txt").read_text().splitlines()) == 5
+
+
+def test_a_tree_is_written_without_times_that_do_not_rise_or_are_not_known_of_all(wandering, tmp_path, heard):
+    (wandering / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (wandering / "times.txt").write_text("1\n2\n")  # of scans 0 and 1, which are not there
+    (wandering / "clouds" / "000007.bin").rename(wandering / "clouds" / "000000.bin")
+    export_scans(str(wandering), tmp_path / "tree", "kitti_odometry")
+    assert heard == ["some scans of sequence 00 have no time or pose, so none is written"]
+    assert sorted(path.name for path in (tmp_path / "tree" / "sequences" / "00").iterdir()) == ["velodyne"]
+    layout = KittiTree(tmp_path / "other")
+    layout.write_motions(["sequences/00/velodyne/000000.bin", "sequences/00/velodyne/000001.bin"], [Motion(1.0)] * 2)
+    assert heard[1:] == ["sequence 00 is written without times, which do not rise from scan to scan"]
+    assert not (tmp_path / "other").exists()

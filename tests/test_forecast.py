@@ -11,7 +11,7 @@ from lidargrit.cli import main
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError, DataError, OutputError
 from lidargrit.data.datasets import open_dataset
-from lidargrit.data.drives import write_motions
+from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.sources import open_images
 from lidargrit.evaluation.likelihood import score_likelihood
@@ -38,7 +38,7 @@ def recorded(tmp_path_factory) -> str:
     range_m = street(4)
     for number, image in enumerate(RangeImage(range_m, range_m > 0, SENSOR.fine())[at] for at in range(4)):
         KittiBin.write(root / "sequences" / "00" / "velodyne" / f"{number:06d}.bin", unproject(image))
-    write_motions(root, "00", [pose.numpy() for pose in way(4)], 0.2)
+    write_motions(root, "00", [pose.numpy() for pose in way(4)], [0.0, 0.2, 0.4, 0.6])
     return f"kitti_odometry:{root}:00"
 
 

@@ -10,6 +10,9 @@ import torch
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.data.datasets import open_dataset
+from lidargrit.data.drives import DriveConfig, write_drives
+from lidargrit.data.export import export_scans
 from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.types import Scan
 
@@ -106,3 +109,18 @@ def test_the_verb_writes_scans_that_are_read_back_and_goes_on_where_it_was_stopp
     assert json.loads((out / "export.json").read_text())["to"]["name"] == "vlp16"
     assert main([*words[:-1], "pcd"]) == 2, "the folder is of another command"
     assert "choose another folder" in capsys.readouterr().err
+
+
+def test_a_tree_of_a_raised_sensor_has_its_poses(tmp_path):
+    sensor = lidargrit.load_sensor("hdl64e_kitti_odometry").with_columns(256)
+    write_drives(tmp_path / "drive", 2, DriveConfig(sensor, seed=2_000_001, frames=2))
+    change = Rescan(sensor, VLP16, raised_m=0.5)
+    export_scans(f"kitti_odometry:{tmp_path / 'drive'}", tmp_path / "out", "kitti_odometry", change=change)
+    low, high = (open_dataset(f"kitti_odometry:{tmp_path / name}").windows(2)[0].scans() for name in ("drive", "out"))
+    for one, other in zip(low, high, strict=True):
+        assert one.pose is not None
+        assert other.pose is not None
+        point = torch.tensor(
+            [3.0, -2, 1, 1]
+        ).double()  # of the second sensor's frame: half a metre higher in the first's
+        torch.testing.assert_close(other.pose @ point, one.pose @ (point + torch.tensor([0, 0, 0.5, 0])))

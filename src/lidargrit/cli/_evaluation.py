@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
 _OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
 _OF_REFERENCE = ("samples", "protocol", "count", "device", *SCANS)
-_OF_FORECASTS = ("forecast", "gem")
-_OF_DRIVES = (*_OF_FORECASTS, "drive")
 _OF_CARDS = ("metrics", "variant", "seed", "samples_format", "weights", "groups", "intervals", "pixel_statistics")
 
 
@@ -22,13 +20,14 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
     from lidargrit.evaluation.comparison import compare_sources, read_config
+    from lidargrit.evaluation.drives import DRIVE, MEASURED
     from lidargrit.evaluation.protocols import public_name
     from lidargrit.evaluation.raydrop import evaluate_streets, streets_of
     from lidargrit.evaluation.reference_file import ENDING
     from lidargrit.viewer.curves import plot_curves
     from lidargrit.viewer.report import write_report
 
-    if public_name(options.protocol) in _OF_DRIVES:
+    if public_name(options.protocol) in (*MEASURED, DRIVE):
         return *_of_drives(options), None
     names = ("protocol", "device", *_OF_CARDS)
     config = read_config(
@@ -58,7 +57,7 @@ def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Score forecasts of drives, or how well the scans of one or two sets of drives fit together."""
     from lidargrit.core.errors import UsageError
     from lidargrit.evaluation.comparison import read_config
-    from lidargrit.evaluation.drives import evaluate_drives, evaluate_forecast
+    from lidargrit.evaluation.drives import MEASURED, evaluate_drives, evaluate_forecast
     from lidargrit.evaluation.protocols import public_name
 
     config = read_config(
@@ -69,7 +68,7 @@ def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
             "no drives", "their folder or source", "name it, as in lidargrit evaluate DRIVES --protocol drive"
         )
     used = ("samples", "protocol", "count", "device", *SCANS)
-    if public_name(options.protocol) in _OF_FORECASTS:
+    if public_name(options.protocol) in MEASURED:
         refuse_unused(options, f"with --protocol {options.protocol}", (*used, "model"))
         return evaluate_forecast(options.samples, config, options.model)
     refuse_unused(options, "with --protocol drive", (*used, "reference"))

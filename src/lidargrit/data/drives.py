@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
@@ -16,9 +15,9 @@ from lidargrit.core.files import (
     claim_folder,
     claimed_manifest,
     write_json,
-    write_text,
 )
 from lidargrit.core.shares import each_done
+from lidargrit.data.datasets.shared.odometry import num_poses, write_motions
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import begun_by
@@ -28,8 +27,6 @@ from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, 
 MANIFEST = "simulated.json"
 _SHARE, _SHARE_ON_RAY = 4, 16  # scans: seconds of work, for a task takes a cluster 30 ms
 _SCANS_PER_SEQUENCE = 10_000  # of streets seen once each: a folder that any file browser still opens
-# KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
-_CAMERA_FROM_SENSOR = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 
 
 @dataclass(frozen=True)
@@ -104,13 +101,13 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
+        _write_sequence_files(out, config, there)  # first, so that what an interrupted call leaves is drives
         missing = [scan for scan in range(there) if not _label_file(out, config, scan).exists()]
         size = _SHARE_ON_RAY if ray else _SHARE
         shares = [missing[first : first + size] for first in range(0, len(missing), size)]
         with reporting.progress("simulating", there, there - len(missing)) as progress:
             for count in each_done(partial(_write_scans, out, config), shares, workers, ray):
                 progress.advance(count)
-        _write_sequence_files(out, config, there)
     return there
 
 
@@ -179,42 +176,17 @@ def _last_scan(out: Path, config: DriveConfig) -> int:
 
 def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:
     """Write what a sequence has once: poses, and times of a drive."""
-    poses: dict[str, list[Float64[np.ndarray, "4 4"]]] = {}
-    for first in range(0, num_scans, config.frames):
-        scans = range(first, min(first + config.frames, num_scans))
-        moved = [np.eye(4)]
-        if config.frames > 1:
-            times_s = [FRAME_S * (scan - first) for scan in scans]
-            way = poses_of(config.street_of(first)[0], times_s, config.sensor, config.theme)
-            moved = [np.linalg.inv(way[0]) @ pose for pose in way]
-        for scan, pose in zip(scans, moved, strict=True):
-            poses.setdefault(config.sequence_and_number(scan)[0], []).append(pose)
-    for sequence, moved in poses.items():
-        write_motions(out, sequence, moved, FRAME_S if config.frames > 1 else None)
-
-
-def write_motions(
-    out: Path, sequence: str, poses: Sequence[Float64[np.ndarray, "4 4"]], period_s: float | None
-) -> None:
-    """Write the poses of a sequence in KITTI's form, the calibration they need, and times.
-
-    Args:
-        out: folder of the tree.
-        sequence: name of the sequence.
-        poses: matrix of each scan from the sensor's frame to that at the first scan.
-        period_s: time from scan to scan, in seconds; None for scans that are no drive, which have no times.
-    """
-    relative = [_CAMERA_FROM_SENSOR @ pose @ np.linalg.inv(_CAMERA_FROM_SENSOR) for pose in poses]
-    projection = _numbers(np.eye(3, 4))
-    calibration = [f"P{camera}: {projection}" for camera in range(4)] + [f"Tr: {_numbers(_CAMERA_FROM_SENSOR[:3])}"]
-    folder = out / "sequences" / sequence
-    lines = "".join(f"{_numbers(pose[:3])}\n" for pose in relative)
-    write_text(out / "poses" / f"{sequence}.txt", lines)
-    write_text(folder / "poses.txt", lines)
-    if period_s is not None:
-        write_text(folder / "times.txt", "".join(f"{number * period_s:e}\n" for number in range(len(relative))))
-    write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
-
-
-def _numbers(matrix: Float64[np.ndarray, "3 4"]) -> str:
-    return " ".join(f"{value:.9e}" for value in matrix.ravel())
+    scans = range(num_scans)
+    if config.frames == 1:
+        for first in scans[:: config.scans_per_sequence]:
+            here = scans[first : first + config.scans_per_sequence]
+            write_motions(out, config.sequence_and_number(first)[0], [np.eye(4)] * len(here))
+        return
+    with reporting.progress("planning", len(scans[:: config.frames])) as progress:
+        for first in scans[:: config.frames]:
+            sequence, _ = config.sequence_and_number(first)
+            times_s = [FRAME_S * number for number in range(len(scans[first : first + config.frames]))]
+            if num_poses(out, sequence) != len(times_s):
+                way = poses_of(config.street_of(first)[0], times_s, config.sensor, config.theme)
+                write_motions(out, sequence, [np.linalg.inv(way[0]) @ pose for pose in way], times_s)
+            progress.advance(1)

@@ -39,7 +39,8 @@ def export_scans(
         source: samples of ours or of another program, a prepared folder, or a source of scans.
         out: an empty folder, or one that the same command began; more scans can be added to it.
         kind: a format's name or one of its endings ("pcd", "npz", ...), or ``kitti_odometry`` for the tree
-            ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels;
+            ``sequences/SS/velodyne/NNNNNN.bin``, with SemanticKITTI's ``labels/NNNNNN.label`` where scans have labels,
+            and ``poses.txt``, ``times.txt`` and ``calib.txt`` where times and poses are known;
             ``mcap`` or ``rrd`` for a recording of each folder of scans, with their times and poses.
         config: number of scans, and what to do with unusable points and scans; nothing else of it is used.
         sensor: sensor of range images that do not name theirs, as ``.npy``; no other source takes one.
@@ -68,6 +69,10 @@ def export_scans(
                     folder.tell_labels_lost(files[index])
                 scans.tell_notes(scan)
             progress.advance(1)
+    if isinstance(layout, KittiTree):
+        motions = [scan.motion for scan in scans.timed_scans()]
+        changed = motions if change is None else [one._replace(pose=change.pose(one.pose)) for one in motions]
+        layout.write_motions(files, changed)
     return folder.num_written
 
 

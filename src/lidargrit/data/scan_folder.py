@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -26,8 +27,10 @@ from lidargrit.core.reporting import Progress
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.datasets.folder import SENSOR_FILE
+from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.scans.motion import Motion
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
@@ -212,6 +215,36 @@ class KittiTree:
     def write(self, file: str, scan: Scan) -> None:
         """Write a scan; see :func:`write_with_labels`."""
         write_with_labels(self._out / file, scan)
+
+    def write_motions(self, files: Sequence[str], motions: Sequence[Motion]) -> None:
+        """Write times and poses of sequences of which every scan has them, so that they are read as drives.
+
+        Row n is of scan n. Where numbers are missing, as in a subset, it is of the n-th file.
+        """
+        sequences = dict[str, dict[str, Motion]]()
+        for file, motion in zip(files, motions, strict=True):
+            sequences.setdefault(PurePosixPath(file).parts[1], {})[file] = motion
+        for sequence, of_files in sequences.items():
+            known = self._in_rows(sequence, of_files)
+            poses = [one.pose.numpy() for one in known if one.pose is not None]
+            times_s = [one.time_s for one in known if one.time_s is not None]
+            if any(one >= other for one, other in pairwise(times_s)):
+                reporting.message(f"sequence {sequence} is written without times, which do not rise from scan to scan")
+                times_s = []
+            elif any(0 < len(some) < len(known) for some in (poses, times_s)):
+                reporting.message(f"some scans of sequence {sequence} have no time or pose, so none is written")
+            complete = len(poses) == len(known), len(times_s) == len(known)
+            write_motions(self._out, sequence, poses * complete[0], times_s * complete[1])
+
+    def _in_rows(self, sequence: str, of_files: dict[str, Motion]) -> list[Motion]:
+        """Return what is to stand in each row; nothing where an earlier command wrote more scans, and their rows."""
+        ordered = sorted(of_files)
+        if ordered != [f"sequences/{sequence}/velodyne/{number:06d}.bin" for number in range(len(ordered))]:
+            ordered = [file for file in ordered if (self._out / file).exists()]
+            folder = self._out / "sequences" / sequence / "velodyne"
+            if len(ordered) < sum(1 for _ in folder.glob("*.bin")):
+                return []
+        return [of_files[file] for file in ordered]
 
 
 def write_with_labels(path: Path, scan: Scan) -> None:

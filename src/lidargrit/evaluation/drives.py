@@ -1,6 +1,6 @@
 """Drives → tables: errors of forecasts of their scans, and how well scans that follow one another fit together."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from statistics import median
 from typing import Any
@@ -27,6 +27,7 @@ from lidargrit.evaluation.drive_errors import (
     gem_errors,
 )
 from lidargrit.evaluation.intervals import Estimate
+from lidargrit.evaluation.odometry import INSTALL, SETTLING_SCANS, kiss_icp_is_there, path_by_kiss_icp, path_errors
 from lidargrit.evaluation.protocols import load_protocol, public_name
 from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
@@ -75,6 +76,8 @@ MEASURED = {
     ),
 }
 """Protocols of forecasts, by their names."""
+DRIVE = "drive"
+"""The protocol of how well scans of a drive fit together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,20 +220,48 @@ def _estimates(errors: Sequence[ErrorsOfForecast]) -> dict[str, Estimate]:
 def evaluate_drives(sources: Sequence[str], config: EvalConfig) -> tuple[str, dict[str, Any]]:
     """Measure how well scans of drives fit together by their poses: generated drives beside recorded ones.
 
+    Where KISS-ICP is installed, the path that it makes of each drive is compared with the poses, too.
+
     Returns:
         a table with a row for each source, and its plain values.
     """
     head = ["drives", "scans", *(f"TTCE {steps} [m]" for steps in _TTCE_STEPS), *(f"CTC {n} [m2]" for n in _CTC_STEPS)]
-    rows, values = [], []
+    rows, values, has_odometry = [], [], kiss_icp_is_there()
     for text in sources:
         drives = _Drives.of(text, config)
         ttce = [_fits(drives, steps, config.max_scans, consistency_error_m) for steps in _TTCE_STEPS]
         ctc = [_fits(drives, steps, config.max_scans, consistency_chamfer_m2) for steps in _CTC_STEPS]
         count = sum(len(drive) for drive in drives.pasts.drives)
-        rows.append((text, str(count), *(each.as_text(".3f") for each in (*ttce, *ctc))))
-        values.append({"drives": text, "scans": count, "ttce_m": [*map(vars, ttce)], "ctc_m2": [*map(vars, ctc)]})
-    about = {"protocol": "drive", "settings": config.facts()}
-    return render([Table(tuple(head), tuple(rows))]), {**about, "sets": values}
+        row = {"drives": text, "scans": count, "ttce_m": [*map(vars, ttce)], "ctc_m2": [*map(vars, ctc)]}
+        cells = [each.as_text(".3f") for each in (*ttce, *ctc)]
+        if has_odometry:
+            step_m, drift = _odometry(drives, config.max_scans)
+            cells += [step_m.as_text(".3f"), drift.as_text(".1%")]
+            row |= {"odometry_step_m": vars(step_m), "odometry_drift": vars(drift)}
+        rows.append((text, str(count), *cells))
+        values.append(row)
+    told = (
+        f"odometry: KISS-ICP's, of moving drives of {SETTLING_SCANS + 2} scans or more, from scan {SETTLING_SCANS} on"
+    )
+    lacking = f"no odometry without KISS-ICP: {INSTALL}"
+    head += ["odometry, a step [m]", "its drift"] if has_odometry else []
+    table = Table(tuple(head), tuple(rows), notes=(told if has_odometry else lacking,))
+    return render([table]), {"protocol": DRIVE, "settings": config.facts(), "sets": values}
+
+
+def _odometry(drives: _Drives, at_most: int) -> tuple[Estimate, Estimate]:
+    """Return by how much the path of KISS-ICP is off the poses: at each step in metres, and as a share of the way."""
+    long = [drive for drive in drives.pasts.drives if len(drive) > SETTLING_SCANS + 1]
+    chosen = [long[at] for at in evenly_spaced(at_most or len(long), len(long))]
+    steps_m, drifts = list[float](), list[float]()
+    with reporting.progress("odometry", sum(map(len, chosen))) as progress:
+        for drive in chosen:
+            poses = [pose for number in drive if (pose := drives.pasts.motion(number).pose) is not None]
+            estimated = path_by_kiss_icp(_scans_m(drives.images, drive, progress))
+            errors = path_errors(estimated, torch.stack(poses).numpy())
+            steps_m += errors.steps_m
+            drifts.append(errors.drift)
+    return Estimate.of(steps_m), Estimate.of(drifts)
 
 
 def _fits(drives: _Drives, steps: int, at_most: int, measure: Measure) -> Estimate:
@@ -247,6 +278,14 @@ def _fits(drives: _Drives, steps: int, at_most: int, measure: Measure) -> Estima
                 values.append(measure(_points_m(images[0]), _points_m(images[1]), transform))
             progress.advance(1)
     return Estimate.of(values)
+
+
+def _scans_m(
+    images: RangeImages, numbers: Sequence[int], progress: reporting.Progress
+) -> Iterator[Float64[np.ndarray, "_ 3"]]:
+    for number in numbers:
+        yield _points_m(images.batch([number])[0])
+        progress.advance(1)
 
 
 def _points_m(image: RangeImage) -> Float64[np.ndarray, "n 3"]:

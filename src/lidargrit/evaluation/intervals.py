@@ -123,7 +123,7 @@ def blocks(count: int, groups: int) -> list[range]:
     """
     groups = min(groups, count)
     groups -= groups % 2 if groups > 1 else 0
-    edges = [index * count // groups for index in range(groups + 1)]
+    edges = [index * count // groups for index in range(groups + 1)] if groups else []
     return [range(first, last) for first, last in pairwise(edges)]
 
 

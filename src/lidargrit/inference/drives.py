@@ -16,7 +16,7 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.datasets import ScanDataset
-from lidargrit.data.drives import write_motions
+from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.run_folder import locate
 from lidargrit.data.scan_folder import KittiTree, ScanFolder
@@ -173,7 +173,7 @@ def write_drives(
     with folder.writing("sampling") as progress:
         for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
             moved = [transform_between(pose, way.poses[0]).numpy() for pose in way.poses]
-            write_motions(out, f"{drive:02d}", moved, way.period_s)
+            write_motions(out, f"{drive:02d}", moved, [number * way.period_s for number in range(len(moved))])
             _Drive(generator, opening, way, seed, out / "sequences" / f"{drive:02d}", settings).write(progress)
     return folder.num_written
 

@@ -124,6 +124,10 @@ class UndoMotion:
         """Return entries of a manifest by which its scans are told from others."""
         return {"motion_undone_by": self.trajectory.source}
 
+    def pose(self, pose: Float64[Tensor, "4 4"] | None) -> Float64[Tensor, "4 4"] | None:
+        """Return the pose of a scan without the motion: its own."""
+        return pose
+
     def __call__(self, scan: Scan) -> Still:
         """Return a scan without the motion."""
         if scan.point_time_s is None:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.scans.sensors import SensorModel
@@ -64,6 +65,14 @@ class Rescan:
         """Return entries of a manifest by which its scans are told from others."""
         return {"to": self.other.to_json(), "of": self.sensor.to_json(), "raised_m": self.raised_m}
 
+    def pose(self, pose: Float64[Tensor, "4 4"] | None) -> Float64[Tensor, "4 4"] | None:
+        """Return the pose of the other sensor by that of the first."""
+        if pose is None:
+            return None
+        raised = torch.eye(4, dtype=torch.float64)
+        raised[2, 3] = self.raised_m
+        return pose @ raised
+
     def __call__(self, scan: Scan) -> Rescanned:
         """Return a cloud as the other sensor sees it."""
         points_xyz_m = scan.points_xyz_m.clone()
@@ -82,7 +91,7 @@ class Rescan:
         if not len(points):
             got = f"{scan.source}, of which the sensor {self.other.name!r} sees no point"
             raise ScanError(got, "clouds whose rays it shares", "check --sensor, or choose another --to")
-        moved = replace(scan, points_xyz_m=points_xyz_m, rows=None)
+        moved = replace(scan, points_xyz_m=points_xyz_m, pose=self.pose(scan.pose), rows=None)
         seen = replace(moved.select(torch.from_numpy(points)), ring=torch.from_numpy(rows.astype(np.int64)))
         return Rescanned(seen, len(rays), int((~known).sum()))
 

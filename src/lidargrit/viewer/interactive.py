@@ -142,6 +142,8 @@ def _source(scan_set: ScanSet) -> dict[str, Any]:
         hidden = scan_set.hidden[index] if scan_set.hidden else 0
         steps = (image.range_m.detach() / step_m).round().clamp(1, _RANGE_STEPS) * image.return_mask
         scan = {"name": name, "range": _packed(steps.numpy().astype("<u2")), "hidden": hidden}
+        if scan_set.times_s:
+            scan["time"] = round(scan_set.times_s[index] - scan_set.times_s[0], 3)
         if beside is not None:
             scan["beside"] = _packed(beside.points_xyz_m.numpy().astype("<f4"))
         if scan_set.anomaly is not None:

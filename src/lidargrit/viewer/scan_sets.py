@@ -10,11 +10,12 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import ConfigError, ScanError, no_usable_scan
+from lidargrit.core.errors import ConfigError, DataError, ScanError, no_usable_scan
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
+from lidargrit.data.windows import TimedScan
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.projection import index_map, project
@@ -41,6 +42,7 @@ class ScanSet:
             scans are no clouds.
         hidden: number of points of each scan that are not shown; empty if all are.
         generated: whether a model generated all of it.
+        times_s: time of each scan on the clock of its drive; empty if it is not known of all.
     """
 
     name: str
@@ -51,6 +53,7 @@ class ScanSet:
     beside: tuple[Scan | None, ...] = ()
     hidden: tuple[int, ...] = ()
     generated: bool = False
+    times_s: tuple[float, ...] = ()
 
 
 def load_scan_sets(
@@ -145,8 +148,15 @@ def _joined(batches: Iterable[RangeImage]) -> RangeImage:
 def _of_images(source: Source, count: int, sensor: SensorModel | None, config: DataConfig) -> ScanSet:
     images = source.images(sensor, source.as_projected(config))
     indices = evenly_spaced(count, len(images))
-    names = images.provenance.names
-    return ScanSet(source.text, images.batch(indices), tuple(names[index].rpartition("/")[2] for index in indices))
+    names = tuple(images.provenance.names[index].rpartition("/")[2] for index in indices)
+    timed = images.timed_scans()
+    return ScanSet(source.text, images.batch(indices), names, times_s=_times_s(timed[index] for index in indices))
+
+
+def _times_s(scans: Iterable[TimedScan]) -> tuple[float, ...]:
+    every = [scan.motion.time_s for scan in scans]
+    known = tuple(time_s for time_s in every if time_s is not None)
+    return known if len(known) == len(every) else ()
 
 
 def _of_scans(
@@ -155,7 +165,7 @@ def _of_scans(
     dataset, imaging = source.scans(), source.imaging(sensor, config)
     imaging.report()
     sensor, config = imaging.sensor, imaging.config
-    images, names, filled, beside, hidden = [], [], [], [], []
+    images, indices, filled, beside, hidden = [], [], [], [], []
     for index in evenly_spaced(count, len(dataset)):
         try:
             scan = dataset.scan(index)
@@ -169,7 +179,7 @@ def _of_scans(
         has_pixel = torch.zeros(len(scan), dtype=torch.bool)
         has_pixel[torch.from_numpy(shown).long()[image.return_mask]] = True
         images.append(image)
-        names.append(dataset.name(index))
+        indices.append(index)
         filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
         without = (~has_pixel).nonzero()[:, 0]
         shown_too = without[evenly_spaced(_BESIDE_AT_MOST * shows_beside, len(without))]
@@ -179,9 +189,14 @@ def _of_scans(
         raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])
     known = any(one is not None for one in filled)
-    stacked = RangeImage.stack(images)
+    stacked, names = RangeImage.stack(images), tuple(map(dataset.name, indices))
     marks = marks if known else None
-    return ScanSet(source.text, stacked, tuple(names), None, marks, tuple(beside), tuple(hidden))
+    try:
+        times_s = _times_s(dataset.timed_scans(indices))
+    except DataError as error:  # files beside the scans, which can be shown without
+        reporting.message(f"times are not known: {error}")
+        times_s = ()
+    return ScanSet(source.text, stacked, names, None, marks, tuple(beside), tuple(hidden), times_s=times_s)
 
 
 def _of_pixels(marks: Bool[Tensor, "n"], point: Int32[np.ndarray, "H W"]) -> Bool[Tensor, "H W"]:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import CheckpointError, ConfigError, ScanError, UsageError, no_usable_scan
+from lidargrit.core.errors import CheckpointError, ConfigError, DataError, ScanError, UsageError, no_usable_scan
 from lidargrit.core.shares import each_done
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
@@ -73,6 +73,7 @@ def compress_scans(
     inputs, chosen = compressor.inputs, {"source": source, "max_scans": config.max_scans}
     names = [inputs.name(index) for index in range(len(inputs))]
     check_names(source, names)  # of which a file has each once
+    _tell_of_drives(inputs, model)
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(compressor.codec, model, sensor), chosen) as writer:
         missing = writer.missing([compressor.identity(index) for index in range(len(inputs))])
@@ -86,6 +87,21 @@ def compress_scans(
         if not returns:
             raise no_usable_scan(source)
     return Compressed(len(returns), sum(returns), out.stat().st_size)
+
+
+def _tell_of_drives(inputs: Inputs, model: str) -> None:
+    """Say that the bundle of a model has one of drives, if the scans are some whose past is known."""
+    of_drives = locate(model, "drive")
+    if of_drives == locate(model):
+        return
+    try:
+        timed = inputs.timed_scans()
+    except DataError:  # in files beside the scans, which are not needed
+        return
+    drives = [one.recording for one in timed if one.motion.time_s is not None and one.motion.pose is not None]
+    if len(drives) > len({*drives}):
+        told = f"{len(drives)} scans have times and poses: --model {model}/{of_drives.name} makes the file smaller"
+        reporting.message(f"{told}, by what earlier scans of a drive tell of later ones")
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 // The whole page: controls, keys, and the panes that follow them.
 
 const TURN_A_FRAME = 0.004; // a turn in half a minute
+const LONGEST_MS = 1000; // that a scan of a drive is shown before the next one, as at the end of the drive
 const DENSE = 50000; // pixels of a scan whose points would cover one another if they were as large as those of others
 
 let touched = false; // whether somebody has taken hold of anything on the page
@@ -13,7 +14,7 @@ class Page {
     this.data = data;
     this.camera = new Camera(data.reachM);
     this.control = Object.fromEntries(
-      ["previous", "next", "position", "counter", "mode", "dropped", "size", "light", "reset", "legend"].map((id) => [
+      ["previous", "next", "play", "position", "counter", "mode", "dropped", "size", "light", "reset", "legend"].map((id) => [
         id,
         document.getElementById(id),
       ]),
@@ -63,6 +64,13 @@ class Page {
     for (const name of ["previous", "next", "position"]) {
       this.control[name].disabled = this.count < 2;
     }
+    this.control.play.hidden = !this.times();
+  }
+
+  // When each scan of a drive was made; nothing where none of the panes shows one.
+  times() {
+    const all = this.panes.map((pane) => pane.source.data.scans.map((scan) => scan.time));
+    return all.find((times) => times.length === this.count && this.count > 1 && !times.includes(undefined));
   }
 
   colourBy(mode) {
@@ -71,10 +79,14 @@ class Page {
   }
 
   listen() {
-    const { previous, next, position, mode, dropped, size, light, reset } = this.control;
+    const { previous, next, play, position, mode, dropped, size, light, reset } = this.control;
     previous.addEventListener("click", () => this.step(-1));
     next.addEventListener("click", () => this.step(1));
-    position.addEventListener("input", () => this.go(Number(position.value) - 1));
+    play.addEventListener("click", () => this.play(!this.playing));
+    position.addEventListener("input", () => {
+      this.play(false);
+      this.go(Number(position.value) - 1);
+    });
     mode.addEventListener("change", () => this.paint());
     dropped.addEventListener("change", () => this.redraw());
     size.addEventListener("input", () => {
@@ -91,6 +103,7 @@ class Page {
     const keys = {
       ArrowLeft: () => this.step(-1),
       ArrowRight: () => this.step(1),
+      p: () => this.play(!this.playing && !this.control.play.hidden),
       a: () => this.camera.orbit(-0.08, 0),
       d: () => this.camera.orbit(0.08, 0),
       w: () => this.camera.orbit(0, 0.08),
@@ -130,7 +143,26 @@ class Page {
 
   // Round and round: after the last comes the first.
   step(by) {
+    this.play(false);
     return this.go((this.index + by + this.count) % this.count);
+  }
+
+  // Show the scans of a drive at their own times, or stop.
+  async play(on) {
+    const turn = on ? {} : null; // another one ends this one
+    this.playing = turn;
+    this.control.play.textContent = on ? "Pause" : "Play";
+    this.control.play.setAttribute("aria-pressed", String(on));
+    this.control.counter.setAttribute("aria-live", on ? "off" : "polite"); // ten scans a second are not read out
+    for (let due = performance.now(); turn && this.playing === turn; ) {
+      const [times, next] = [this.times(), (this.index + 1) % this.count];
+      const passed = 1000 * (times?.[next] - times?.[this.index]);
+      due = Math.max(due + (passed > 0 ? Math.min(passed, LONGEST_MS) : LONGEST_MS), performance.now());
+      await new Promise((done) => setTimeout(done, due - performance.now()));
+      if (this.playing === turn) {
+        await this.go(next);
+      }
+    }
   }
 
   async go(index) {

@@ -1,5 +1,6 @@
-"""The files of one KITTI sequence, ``times.txt``, ``poses.txt``, ``calib.txt`` → when and where each scan was made."""
+"""The files of one KITTI sequence, ``times.txt``, ``poses.txt``, ``calib.txt`` ⇄ when and where each scan was made."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import torch
 from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError, DataError
-from lidargrit.core.files import read_text
+from lidargrit.core.files import read_text, write_text
 from lidargrit.scans.motion import Motion
 
+# KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
+_CAMERA_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
 _POSE = "12 finite numbers in each row, the first three rows of a pose"
 
 
@@ -82,3 +85,35 @@ def _lines(path: Path) -> list[str]:
         return read_text(path).splitlines() if path.exists() else []
     except ConfigError as error:
         raise DataError(error.got, error.wanted, error.cure) from None
+
+
+def write_motions(
+    out: Path, sequence: str, poses: Sequence[Float64[np.ndarray, "4 4"]], times_s: Sequence[float] = ()
+) -> None:
+    """Write the poses of a sequence in KITTI's form with the calibration they need, and the times of its scans.
+
+    Args:
+        out: folder of the tree; poses lie in ``poses/SS.txt``, where KITTI's own tools look, too.
+        sequence: name of the sequence.
+        poses: matrix of each scan from the sensor's frame to that of the drive; none where they are not known.
+        times_s: time of each scan in seconds; none of scans that are no drive.
+    """
+    folder = out / "sequences" / sequence
+    if times_s:
+        write_text(folder / "times.txt", "".join(f"{time_s:.9f}\n" for time_s in times_s))
+    if len(poses):
+        lines = "".join(f"{_row(_CAMERA_AXES @ pose @ _CAMERA_AXES.T)}\n" for pose in poses)
+        calibration = [f"P{camera}: {_row(np.eye(4))}" for camera in range(4)] + [f"Tr: {_row(_CAMERA_AXES)}"]
+        write_text(out / "poses" / f"{sequence}.txt", lines)
+        write_text(folder / "calib.txt", "".join(f"{line}\n" for line in calibration))
+        write_text(folder / "poses.txt", lines)  # last: it says that the others are there
+
+
+def num_poses(out: Path, sequence: str) -> int:
+    """Return how many poses of a sequence of a tree are there."""
+    return len(_lines(out / "sequences" / sequence / "poses.txt"))
+
+
+def _row(matrix: Float64[np.ndarray, "4 4"]) -> str:
+    """Return the first three rows in as many digits as lead back to the same numbers."""
+    return " ".join(f"{value:.16e}" for value in matrix[:3].ravel())

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from lidargrit.core import reporting
 from lidargrit.core.determinism import natural_order
-from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.errors import ConfigError, DataError, printable
 from lidargrit.core.files import read_text
 from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.scans.motion import Motion
@@ -44,9 +45,13 @@ def time_beside(path: Path) -> float | None:
 
 @lru_cache(maxsize=64)
 def _is_trajectory(path: Path) -> bool:
-    """Return whether a file has TUM's rows of a time and a pose, which are of no scan in particular."""
+    """Return whether a file has TUM's rows of a time and a pose, which are of no scan in particular; tell it once."""
     rows = (row for row in read_text(path).splitlines() if row.strip() and not row.lstrip().startswith("#"))
-    return len(next(rows, "").split()) == _TUM_COLUMNS
+    if len(next(rows, "").split()) != _TUM_COLUMNS:
+        return False
+    cure = "KITTI's 12 numbers in a row for each scan would be; export --undo-motion takes it as it is"
+    reporting.message(f"{printable(str(path))} has poses in TUM's form, which are not taken as those of scans: {cure}")
+    return True
 
 
 @lru_cache(maxsize=64)
