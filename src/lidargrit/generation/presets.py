@@ -20,16 +20,23 @@ STREETS = DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",))
 MORE_STREETS = replace(STREETS, train=("simulated:4352:train",))
 WIDE_STREETS = DataConfig(("simulated:1000:train",), ("simulated:24:val",), columns=2048, column_stride=2)
 _SENSORS = 64
-ANY_SENSOR = DataConfig(  # of each sensor other streets
-    tuple(
-        f"simulated:4352@drawn_{n}:train[{100 * n / _SENSORS:g}%:{100 * (n + 1) / _SENSORS:g}%]"
-        for n in range(_SENSORS)
-    ),
-    tuple(f"simulated:24@drawn_{n}:val[{25 * (n - 1000)}%:{25 * (n - 999)}%]" for n in range(1000, 1004)),
-    columns=2048,
-    column_stride=8,
-    own_sensors=True,
-)
+
+
+def any_sensor(data_set: str, streets: int) -> DataConfig:
+    """Return the data of a model for any sensor: streets, of which each drawn sensor sees others."""
+    return DataConfig(
+        tuple(
+            f"{data_set}:{streets}@drawn_{n}:train[{100 * n / _SENSORS:g}%:{100 * (n + 1) / _SENSORS:g}%]"
+            for n in range(_SENSORS)
+        ),
+        tuple(f"{data_set}:24@drawn_{n}:val[{25 * (n - 1000)}%:{25 * (n - 999)}%]" for n in range(1000, 1004)),
+        columns=2048,
+        column_stride=8,
+        own_sensors=True,
+    )
+
+
+ANY_SENSOR = any_sensor("simulated", 4352)
 DEMO_STREETS = DataConfig(train=("simulated:300:train",), val=("simulated:16:val",))
 KITTI_360 = DataConfig(
     ("kitti_360:data/kitti_360:train_without_val",), ("kitti_360:data/kitti_360:val",), "hdl64e_kitti_360"

@@ -14,6 +14,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
+from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
 from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise, following
 from lidargrit.generation.pixel_decoder.pixel_phases import (
@@ -273,15 +274,17 @@ class MaskNetwork(PhaseNetwork):
         self.noise = PhaseNoise(self._learned, places)
 
     @classmethod
-    def behind(cls, features: int, width: int, sensor: SensorModel) -> "MaskNetwork":
+    def behind(cls, features: int, width: int, network: RayNetwork) -> "MaskNetwork":
         """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
         it sees.
 
         Args:
             features: channels of the other network's features.
             width: channels of the layers.
+            network: the other network, which tells the sensor, and whether it is any.
         """
-        return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
+        config = PixelDecoderConfig(mask_features=features, mask_width=width, any_sensor=network.any_sensor)
+        return cls(config, network.grid, features, network.sensor.height)
 
     def context(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"]

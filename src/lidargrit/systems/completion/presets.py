@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.presets import LATER_STAGE, MORE_STREETS, WIDE_STREETS, preset
+from lidargrit.generation.presets import ANY_SENSOR, LATER_STAGE, MORE_STREETS, WIDE_STREETS, preset
+from lidargrit.systems.completion.network import CompletionNetworkConfig
 from lidargrit.systems.completion.system import CompletionConfig
 
 _COMPLETION = replace(
@@ -20,6 +21,12 @@ PRESETS = {
         "a network that completes scans: 64x256, for one CPU core and an hour",
         MORE_STREETS,
         CompletionConfig(),
+        completion=_COMPLETION,
+    ),
+    "completion_any": preset(
+        "a network that completes scans of any spinning sensor: for one CPU core and an hour",
+        ANY_SENSOR,
+        CompletionConfig(CompletionNetworkConfig(row_channels=4, any_sensor=True)),
         completion=_COMPLETION,
     ),
     "completion_wide": preset(

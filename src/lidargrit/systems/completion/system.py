@@ -64,7 +64,8 @@ class CompletionObjective(Objective):
         absolute error.
         """
         images, rng = example.images, of_host(rng)
-        observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
+        network = self.completion.for_sensor(images.sensor)
+        observed = random_patterns(len(images), images.sensor.height, images.sensor.width, rng)
         # Features are searched for on the host, so all that they need is brought there once.
         condition, learned = Observed.of_pixels(images.to("cpu"), observed), self.completion.config
         planes = dict[str, Tensor]()  # no features are computed of what the network does not see
@@ -75,11 +76,12 @@ class CompletionObjective(Objective):
             planes["reflectance"] = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
         condition = replace(condition, planes=planes)
         observed = observed.to(images.range_m.device)
-        point = self.completion(classical_features(condition, images.range_m.device), observed)
+        point = network(classical_features(condition, images.range_m.device), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
         count, num_returns = hidden.sum((1, 2)).clamp(min=1), returns.sum((1, 2)).clamp(min=1)
-        nats = self.completion.mask.nats(point.guide, images.return_mask, rng if self.training else None) / count
+        true = network.padded(images.return_mask)
+        nats = network.mask.nats(point.guide, true, rng if self.training else None) / count
         alone = F.binary_cross_entropy_with_logits(point.return_logits, images.return_mask.float(), reduction="none")
         alone = (alone * hidden).sum((1, 2)) / count
         log_error = ((point.v - images.range_m.log1p()).abs() * returns).sum((1, 2)) / num_returns

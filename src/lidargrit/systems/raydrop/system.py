@@ -62,13 +62,14 @@ class RaydropObjective(Objective):
         if self.training:
             noise = torch.randn(range_m.shape, generator=rng, device=rng.device)
             most = torch.rand((len(range_m), 1, 1), generator=rng, device=rng.device) * _NOISE_M
-            range_m = (range_m + noise * most).clamp(min=self.sensor.range_min_m)
+            range_m = (range_m + noise * most).clamp(min=images.sensor.range_min_m)
         label = None
         if self.raydrop.classes is not None:
             label = hidden_in_some(labels_to_learn(images.label), 0, _WITHOUT_LABELS, rng)
-        found = self.raydrop(range_m, surface, label)
+        network = self.raydrop.for_sensor(images.sensor)
+        found = network(range_m, surface, label)
         count = surface.float().sum((1, 2)).clamp(min=1)
-        nats = self.raydrop.mask.nats(found.guide, returned, rng if self.training else None) / count
+        nats = network.mask.nats(found.guide, network.padded(returned), rng if self.training else None) / count
         alone = F.binary_cross_entropy_with_logits(found.logits, returned.float(), reduction="none")
         alone = (alone * surface).sum((1, 2)) / count
         bits = {"mask_bits": nats.mean().detach() / math.log(2), "alone_bits": alone.mean().detach() / math.log(2)}
