@@ -10,9 +10,11 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors
+from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import WEIGHTS_FILE, locate
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.nn.quantization import without_quantized
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
@@ -23,6 +25,7 @@ from lidargrit.systems.completion.network import CompletionNetwork, CompletionNe
 from lidargrit.systems.completion.system import Completion, CompletionConfig
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
 from lidargrit.systems.raydrop.system import Raydrop, RaydropConfig
+from lidargrit.training.taken_stages import taken_stages
 from pixel_decoder_examples import random_images, tiny_sensor
 
 EVEN, ODD = tiny_sensor(16, 32), tiny_sensor(13, 24)  # the second has 3 absent rows
@@ -193,6 +196,28 @@ def test_raydrop_of_rows_half_as_far_apart_is_told_so() -> None:
         wanted = -sensor.elevation_rad[44:60, 0].sin()
         found.append(float((cos.mean(1) / wanted).log().abs().max()))
     assert max(found) < 0.2  # on level ground the cosine of incidence is the sine of the elevation
+
+
+@pytest.mark.parametrize("kind", ["completion", "raydrop"])
+def test_training_for_any_sensor_starts_from_a_network_of_one(kind: str, tmp_path) -> None:
+    """All weights but those of its rows are taken over, whatever the number of rows."""
+    given = generator(kind, load_sensor("hdl64e_kitti_odometry").with_columns(32), any_sensor=False)
+    given.save(tmp_path)
+    config = CompletionConfig(COMPLETION) if kind == "completion" else RaydropConfig(RAYDROP)
+    fit = TrainingConfig(scans=2, batch_size=2, learning_rate=1e-3, start=str(tmp_path))
+    preset = Preset("a test", kind, config, DataConfig(sensor="vlp16", columns=256), {kind: fit})
+    wanted = preset.build_generator()
+    taken = wanted.objective(kind).weights_from(taken_stages(preset, wanted)[kind])
+    own = given.objective(kind).state_dict()
+    assert {*own} - {*taken} == {f"{kind}.rows", f"{kind}.mask.rows", f"{kind}.mask.row_bias"}
+    assert all(torch.equal(weight, own[name]) for name, weight in taken.items())
+    wanted.objective(kind).load_state_dict(taken, strict=False)
+    one_sensor = type(config)(replace(getattr(config, kind), any_sensor=False))
+    back = replace(preset, model=one_sensor, data=DataConfig(columns=32))
+    wanted.save(tmp_path / "any")
+    back = replace(back, training={kind: replace(fit, start=str(tmp_path / "any"))})
+    with pytest.raises(ConfigError, match=f"whose {kind} is another .model.{kind}.any_sensor=True"):
+        taken_stages(back, back.build_generator())
 
 
 @pytest.fixture(scope="module")

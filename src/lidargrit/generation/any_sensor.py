@@ -91,6 +91,12 @@ class RayNetwork(nn.Module, ABC):
         return torch.cat((of_rows, self.azimuth[None, :, None].expand(count, -1, height, -1)), 1)
 
 
+def told_rays_in_place_of_rows(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
+    """Return those weights of a network of one sensor that one which is told its rays has, too: all but its rows'."""
+    own = network.state_dict()
+    return {name: weight for name, weight in weights.items() if name in own}
+
+
 def sharing_weights(made: ModuleT, trained: nn.Module) -> ModuleT:
     """Return a module whose weights are those of another one of the same sizes, the very same tensors."""
     for name, weight in trained.state_dict(keep_vars=True).items():

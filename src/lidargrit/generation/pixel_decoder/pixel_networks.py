@@ -26,7 +26,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     one_of_phases,
     phases_of,
 )
-from lidargrit.generation.pixel_decoder.ray_encoding import RowEncoding, coarsest_cell_of
+from lidargrit.generation.pixel_decoder.ray_encoding import LEAST_CELL, RowEncoding, coarsest_cell_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.condition import Observed
@@ -103,10 +103,12 @@ class PixelDecoderConfig(Settings):
         return phases_of(cell, self.column_halvings, self.row_halvings)
 
     def learned_phases(self) -> list[Phase]:
-        """Return the phases of all images that the networks know: any lattice may be the first one of some sensor."""
+        """Return the phases of all images that the networks know: any large lattice may be some sensor's first."""
         phases = phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
+        if not self.any_sensor or self.coarsest_cell <= LEAST_CELL:
+            return phases
         lattices = dict.fromkeys(phase.lattice for phase in phases)
-        return [Phase(each, *at) for each in lattices for at in each.order] if self.any_sensor else phases
+        return [Phase(each, *at) for each in lattices for at in each.order]
 
 
 class Guide(NamedTuple):

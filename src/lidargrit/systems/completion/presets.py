@@ -24,10 +24,12 @@ PRESETS = {
         completion=_COMPLETION,
     ),
     "completion_any": preset(
-        "a network that completes scans of any spinning sensor: for one CPU core and an hour",
+        "a network that completes scans of any spinning sensor: for one CPU core and half an hour",
         ANY_SENSOR,
-        CompletionConfig(CompletionNetworkConfig(row_channels=4, any_sensor=True)),
-        completion=_COMPLETION,
+        CompletionConfig(CompletionNetworkConfig(any_sensor=True)),
+        completion=replace(
+            _COMPLETION, scans=8000, learning_rate=8e-4, average_over_scans=300, start="pretrained/completion"
+        ),
     ),
     "completion_wide": preset(
         "a network that completes scans: 64x1024, for one CPU core and half an hour",

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.core.configuration import Settings
+from lidargrit.generation.any_sensor import told_rays_in_place_of_rows
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -42,12 +43,17 @@ class CompletionObjective(Objective):
     root of their hidden share.
     """
 
-    additions = frozenset({"labels", "reflectance"})
+    additions = frozenset({"labels", "reflectance", "any_sensor"})
     reaches_all_weights = False  # some phases stand for all
 
     def __init__(self, network: CompletionNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.completion = network
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained network, for any sensor without those of the rows of a single one."""
+        weights = super().weights_from(trained)
+        return told_rays_in_place_of_rows(weights, self) if self.completion.any_sensor else weights
 
     def check(self, images: RangeImage) -> None:
         """Refuse images without the labels or the reflectance that are to be learned."""

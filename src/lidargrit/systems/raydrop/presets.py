@@ -26,9 +26,9 @@ PRESETS = {
         raydrop=_RAYDROP,
     ),
     "raydrop_any": preset(
-        "a network of raydrop for clean scans of any spinning sensor: for one CPU core and half an hour",
+        "a network of raydrop for clean scans of any spinning sensor: for one CPU core and ten minutes",
         any_sensor("simulated_surfaces", 1024),
-        RaydropConfig(RaydropNetworkConfig(row_channels=4, any_sensor=True)),
-        raydrop=replace(_RAYDROP, scans=8000),
+        RaydropConfig(RaydropNetworkConfig(any_sensor=True)),
+        raydrop=replace(_RAYDROP, start="pretrained/raydrop"),
     ),
 }
