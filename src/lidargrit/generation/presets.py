@@ -19,6 +19,8 @@ _SCANS = 2000  # of each stage of a default preset: minutes, not hours
 STREETS = DataConfig(train=("simulated:2000:train",), val=("simulated:32:val",))
 MORE_STREETS = replace(STREETS, train=("simulated:4352:train",))
 WIDE_STREETS = DataConfig(("simulated:1000:train",), ("simulated:24:val",), columns=2048, column_stride=2)
+# One street for a dozen sensors would save a fourth of the time at most: of a scan's 128 ms the scene takes 20, and its
+# tree 13; the rest are each sensor's own rays.
 _SENSORS = 64
 
 
