@@ -13,13 +13,14 @@ import torch
 import xarray
 import zarr
 
-from lidargrit.core.errors import DataError
+from lidargrit.core.errors import DataError, ScanError
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.arrays import store_context, store_of
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedImages
 from lidargrit.data.sources import load_range_images
+from lidargrit.scans.marks import read_marks
 
 SIMULATED = DataConfig(workers=1)
 
@@ -109,3 +110,18 @@ def test_other_programs_for_zarr_read_the_images(tree, tmp_path):
         pixels = images.read(index)
         assert np.array_equal(np.asarray(steps[index]) * np.float32(step_m), pixels.range_m)
         assert np.array_equal(opened["reflectance"][index].values * np.float32(1 / 255), pixels.planes["reflectance"])
+
+
+def test_streets_of_one_seed_are_told_apart_by_what_is_made_of_them(tmp_path, monkeypatch):
+    """Surfaces have the seeds of measured streets, and another sensor may scan them; the cache must not mix them up."""
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path))
+    config = DataConfig(workers=1, columns=64)
+    sources = ("simulated:1:val", "simulated_surfaces:1:val")
+    measured, surfaces = (load_range_images((source,), config).batch([0]) for source in sources)
+    assert measured.reflectance is not None
+    assert surfaces.reflectance is not None
+    assert not read_marks(measured.reflectance).is_clear
+    assert read_marks(surfaces.reflectance).is_clear
+    assert surfaces.return_mask.sum() > measured.return_mask.sum()
+    with pytest.raises(ScanError, match="rings that lie elsewhere"):  # and not the scan of the other sensor
+        load_range_images(("simulated:1@vlp16:val",), config)

@@ -112,7 +112,8 @@ def read_config(folder: Path) -> SavedConfig:
 
 def takes_any_sensor(folder: Path) -> bool:
     """Return whether the networks of a finished run are told of a sensor's rays; its own is then but one of many."""
-    return is_run(folder) and configuration.leaves(read_config(folder).config).get("pixels.any_sensor") is True
+    settings = configuration.leaves(read_config(folder).config) if is_run(folder) else {}
+    return any(name.endswith(".any_sensor") and value is True for name, value in settings.items())
 
 
 @contextmanager

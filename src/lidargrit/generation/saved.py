@@ -5,13 +5,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Generic, Self, TypeVar, final
 
+import torch
 from torch import Tensor, nn
 
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_tensors, write_json, write_tensors, write_text
 from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE, Job, read_config, told_of
+from lidargrit.generation.any_sensor import RayNetwork, sharing_weights
 from lidargrit.generation.hub import upload
+from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.quantization import WeightBits, with_quantized, without_quantized
 from lidargrit.nn.size import numbers_at_most, numbers_of_files
@@ -80,11 +83,16 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         Raises:
             ConfigError: a sensor that it does not take, with those that it takes.
         """
+        networks = list(self.children())
+        if networks and all(isinstance(each, RayNetwork) and each.any_sensor for each in networks):
+            check_bounds(sensor)
+            with torch.random.fork_rng(devices=[]):  # the weights that it begins with are not used
+                return sharing_weights(type(self)(self.config, sensor), self).train(self.training)
         if not self.sensor.same_rays(sensor):
             raise ConfigError(
                 f"the sensor {sensor.name!r}, {sensor.height}x{sensor.width}, for {self.public_name()!r}",
                 f"its own, {self.sensor.name!r}, {self.sensor.height}x{self.sensor.width}",
-                "name a run of that sensor, or train the preset multiscale_any, which takes any",
+                "name a run of that sensor, or train multiscale_any, completion_any or raydrop_any, which take any",
             )
         return self
 

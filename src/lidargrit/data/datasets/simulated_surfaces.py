@@ -17,10 +17,14 @@ class SimulatedSurfaces(Streets):
 
     title = "simulated streets: every surface, and which of them return"
 
+    def name(self, index: int) -> str:
+        """Name one scan by its seed, and not as that of the street which is measured: "surfaces_0000012"."""
+        return f"surfaces_{self.seeds[index]:07d}"
+
     def scan(self, index: int) -> Scan:
         """Simulate one scan."""
         # Only here: naming and counting need no simulator.
         from lidargrit.simulator import observe  # noqa: PLC0415
 
-        sensor, source = self.made_by, f"surfaces of {self.name(index)}"
+        sensor, source = self.made_by, f"surfaces of seed {self.seeds[index]}"
         return observe(self.seeds[index], sensor).surfaces(source, (sensor.range_min_m, sensor.range_max_m))

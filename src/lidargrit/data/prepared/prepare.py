@@ -17,6 +17,7 @@ from lidargrit.core.files import claim_folder, is_taken, sha256_of_json, write_j
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
+from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.prepared.arrays import range_step_m
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.imaging import choose_projection
@@ -192,8 +193,8 @@ def _spec(
         scans.append((name, dataset.recording(index), size, time_ns, *_time_and_pose(dataset, index)))
         beside += filter(None, map(_state, dataset.sidecar_files(index)))
     others = json.dumps(beside) if beside else ""
-    # A file of a sensor by which scans are simulated may change, and its name stays the same.
-    if dataset.sensor.lower().endswith(".json"):
+    # The sensor by which scans are simulated is in no name of theirs, and its file may change.
+    if dataset.sensor.lower().endswith(".json") or (isinstance(dataset, Streets) and dataset.sensor != Streets.sensor):
         others += json.dumps(load_sensor(dataset.sensor).to_json())
     spec = PreparedSpec(
         format=FORMAT,

@@ -8,10 +8,11 @@ from typing import Annotated, NamedTuple
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Temperature, Weight
+from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import (
@@ -22,7 +23,6 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     one_of_phases,
 )
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
-from lidargrit.generation.pixel_decoder.ray_encoding import with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.processes import mean_over_processes
@@ -41,8 +41,6 @@ _ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so m
 _NOISE_AT_MOST = 1e6  # beyond, the components' scales have no finite numbers; with 100 all ranges are noise already
 
 _EVEN = 0.4999  # in place of a random number: what is as likely as not returns
-
-_SENSORS_KEPT = 256  # whose rows are encoded, and whose surfaces are known
 
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
@@ -88,7 +86,7 @@ class PixelNll(NamedTuple):
     range: Float[Tensor, "B H W"]
 
 
-class PixelDecoder(nn.Module):
+class PixelDecoder(RayNetwork):
     """Mask and range of every pixel, phase by phase, each phase given all earlier ones.
 
     Reflectance is not sampled: it is the mean that the tokenizer's decoder gives, if it gives one.
@@ -109,34 +107,17 @@ class PixelDecoder(nn.Module):
     def __init__(
         self, config: PixelDecoderConfig, sensor: SensorModel, features: int, components: int = 1, gaps: bool = False
     ) -> None:
-        super().__init__()
+        super().__init__(sensor, config.any_sensor)
         if not config.any_sensor:
             _check_size(config, sensor)
-        self.config, self.sensor, self._sizes = config, sensor, (features, components, gaps)
-        self._others: dict[SensorModel, PixelDecoder] = {}
-        self.grid = with_absent_rows(sensor) if config.any_sensor else sensor
+        self.config, self._sizes = config, (features, components, gaps)
         self.mask = MaskNetwork(config, self.grid, features, sensor.height)
         decoded = components if config.decoded_components and features else 0
         self.range = RangeNetwork(config, self.grid, features, decoded, gaps, sensor.height)
 
-    def for_sensor(self, sensor: SensorModel) -> "PixelDecoder":
-        """Return the decoder of another sensor's images with the very same weights: what one learns the other knows.
-
-        A decoder that is not for any sensor returns itself. What is computed of a sensor's rays is kept.
-        """
-        if not self.config.any_sensor or sensor is self.sensor:
-            return self
-        device, found = self.mask.before.device, self._others.get(sensor)
-        if found is None or found.mask.before.device != device:
-            with torch.random.fork_rng(devices=[]):  # the weights that it begins with are not used
-                found = PixelDecoder(self.config, sensor, *self._sizes).to(device)
-            for name, weight in self.state_dict(keep_vars=True).items():
-                module, _, last = name.rpartition(".")
-                setattr(found.get_submodule(module), last, weight)
-            if len(self._others) >= _SENSORS_KEPT:
-                del self._others[next(iter(self._others))]
-            self._others[sensor] = found
-        return found.train(self.training)
+    def made_for(self, sensor: SensorModel) -> "PixelDecoder":
+        """Return a new decoder of the same sizes for another sensor."""
+        return PixelDecoder(self.config, sensor, *self._sizes)
 
     def forward(self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps | None = None) -> PixelNll:
         """Return the exact negative log-likelihood of every pixel, given what was decoded from the tokens.
@@ -178,8 +159,7 @@ class PixelDecoder(nn.Module):
 
     def _whole(self, images: RangeImage) -> RangeImage:
         """Return images with the absent rows, in which nothing returns."""
-        absent = self.grid.height - self.sensor.height
-        return images.mapped(lambda pixels: F.pad(pixels, (0, 0, 0, absent)), self.grid) if absent else images
+        return images if self.grid is self.sensor else images.mapped(self.padded, self.grid)
 
     def bits(
         self, decoded: Decoded | None, images: RangeImage, steps: RangeSteps, expected: bool
@@ -265,10 +245,7 @@ class PixelDecoder(nn.Module):
         device = guide.v.device
         uniform = uniform.to(device)
         condition = condition.to(device) if condition else Observed.nothing(self.sensor, len(rngs), device)
-        if absent := self.grid.height - self.sensor.height:
-            maps = condition.range_m, condition.range_observed, condition.return_mask, condition.return_observed
-            range_m, range_observed, mask, observed = (F.pad(each, (0, 0, 0, absent)) for each in maps)
-            condition = Observed(range_m, range_observed, mask, observed, self.grid)
+        condition = self.padded_condition(condition)
         # One scan after the other on a CPU: with other batch sizes its sums have other rounding errors.
         step = 1 if device.type == "cpu" else len(uniform)
         images = []

@@ -14,6 +14,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
+from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
 from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise, following
 from lidargrit.generation.pixel_decoder.pixel_phases import (
@@ -25,7 +26,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     one_of_phases,
     phases_of,
 )
-from lidargrit.generation.pixel_decoder.ray_encoding import RowEncoding, coarsest_cell_of
+from lidargrit.generation.pixel_decoder.ray_encoding import LEAST_CELL, RowEncoding, coarsest_cell_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.condition import Observed
@@ -102,10 +103,12 @@ class PixelDecoderConfig(Settings):
         return phases_of(cell, self.column_halvings, self.row_halvings)
 
     def learned_phases(self) -> list[Phase]:
-        """Return the phases of all images that the networks know: any lattice may be the first one of some sensor."""
+        """Return the phases of all images that the networks know: any large lattice may be some sensor's first."""
         phases = phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
+        if not self.any_sensor or self.coarsest_cell <= LEAST_CELL:
+            return phases
         lattices = dict.fromkeys(phase.lattice for phase in phases)
-        return [Phase(each, *at) for each in lattices for at in each.order] if self.any_sensor else phases
+        return [Phase(each, *at) for each in lattices for at in each.order]
 
 
 class Guide(NamedTuple):
@@ -273,15 +276,17 @@ class MaskNetwork(PhaseNetwork):
         self.noise = PhaseNoise(self._learned, places)
 
     @classmethod
-    def behind(cls, features: int, width: int, sensor: SensorModel) -> "MaskNetwork":
+    def behind(cls, features: int, width: int, network: RayNetwork) -> "MaskNetwork":
         """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
         it sees.
 
         Args:
             features: channels of the other network's features.
             width: channels of the layers.
+            network: the other network, which tells the sensor, and whether it is any.
         """
-        return cls(PixelDecoderConfig(mask_features=features, mask_width=width), sensor, features)
+        config = PixelDecoderConfig(mask_features=features, mask_width=width, any_sensor=network.any_sensor)
+        return cls(config, network.grid, features, network.sensor.height)
 
     def context(
         self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"]

@@ -15,7 +15,7 @@ from lidargrit.scans.sensors import SensorModel, SensorSetup
 _CYCLES = (2, 4, 8, 16, 32, 64)  # a radian: from the whole field to half a degree
 _HIDDEN = 32
 _ROWS_AT_ONCE = 16  # rows of an image are a multiple of it; absent ones fill it up
-_LEAST_CELL = 8
+LEAST_CELL = 8
 _ABSENT_APART_RAD = 1e-3
 _TYPICAL_STEP_RAD, _TYPICAL_HEIGHT_M, _TYPICAL_LIMITS_M = math.radians(0.5), 1.8, (1.0, 100.0)
 
@@ -67,10 +67,10 @@ def coarsest_cell_of(sensor: SensorModel, at_most: int) -> int:
         at_most: largest side.
     """
     cell = math.gcd(sensor.height, sensor.width, at_most)
-    if cell < min(_LEAST_CELL, at_most):
+    if cell < min(LEAST_CELL, at_most):
         got = f"the sensor {sensor.name!r} of {sensor.width} columns"
         cure = "choose them with --set data.columns=1024" if sensor.width > 1024 else "choose other columns"
-        raise ConfigError(got, f"a multiple of {_LEAST_CELL} columns", cure)
+        raise ConfigError(got, f"a multiple of {LEAST_CELL} columns", cure)
     return cell
 
 

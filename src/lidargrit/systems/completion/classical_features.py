@@ -1,6 +1,6 @@
 """Observed pixels → maps for a network that completes scans, and ranges to choose from, by classical methods."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,11 @@ class ClassicalFeatures(NamedTuple):
     candidates: Float[Tensor, "B 9 H W"]
     labels: Int[Tensor, "B 5 H W"] | None = None
     reflectances: Float[Tensor, "B 6 H W"] | None = None
+
+    def mapped(self, function: Callable[[Tensor], Tensor]) -> "ClassicalFeatures":
+        """Return the features with a function applied to the maps of each."""
+        labels, reflectances = (None if each is None else function(each) for each in (self.labels, self.reflectances))
+        return ClassicalFeatures(function(self.maps), function(self.candidates), labels, reflectances)
 
     def mirrored(self) -> "ClassicalFeatures":
         """Return the classical features of the scans' mirror images, left and right exchanged."""

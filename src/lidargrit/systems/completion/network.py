@@ -7,17 +7,18 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count, NotNegative
+from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Observed
-from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.classical_features import (
     LABELLED,
@@ -49,6 +50,8 @@ class CompletionNetworkConfig(Settings):
         features: number of channels that the phases of the mask see.
         mask_width: number of channels of the layers of the mask's phases.
         row_channels: number of learned values of every row.
+        any_sensor: whether the network is told the angles of each row, by a small perceptron, in place of values that
+            are learned row by row, so that the weights serve every spinning sensor.
         labels: whether the network sees the classes of observed pixels, where scans have them, and estimates those of
             the others: the 19 classes of SemanticKITTI's benchmark.
         reflectance: whether the network sees the reflectance of observed pixels, where scans have it, and estimates
@@ -62,6 +65,7 @@ class CompletionNetworkConfig(Settings):
     features: Count = 32
     mask_width: Count = 24
     row_channels: Count = 2
+    any_sensor: bool = False
     labels: bool = False
     reflectance: bool = False
 
@@ -79,7 +83,7 @@ class CompletionOutput(NamedTuple):
     """Point estimate of every pixel by the network.
 
     Args:
-        guide: inputs of the phases of the mask.
+        guide: inputs of the phases of the mask, with the network's absent rows.
         v: ln(1 + range in metres), with its gradient.
         return_logits: logits of the probability of a return by itself, with their gradient.
         class_logits: logits of the classes, with their gradient; None from a network without classes.
@@ -93,7 +97,7 @@ class CompletionOutput(NamedTuple):
     reflectance: Float[Tensor, "B H W"] | None = None
 
 
-class CompletionNetwork(nn.Module):
+class CompletionNetwork(RayNetwork):
     """A small U-Net that weighs the ranges of classical methods, and a mask that is sampled in phases behind it.
 
     Range and reflectance are point estimates, the best single guess, and no samples; the mask is sampled, each phase
@@ -101,13 +105,11 @@ class CompletionNetwork(nn.Module):
     """
 
     def __init__(self, config: CompletionNetworkConfig, sensor: SensorModel) -> None:
-        super().__init__()
-        check_size(sensor.height, sensor.width, "a network that completes scans")
+        super().__init__(sensor, config.any_sensor)
+        check_size(self.grid.height, sensor.width, "a network that completes scans")
         self.config = config
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
-        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
-        azimuth_rad = mean_azimuths_rad(sensor.azimuth_rad).float()
-        self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
+        self._tell_rays(config.row_channels)
         sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
         self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
         self.outputs = [config.features, NUM_CANDIDATES, 1, 1]
@@ -117,13 +119,16 @@ class CompletionNetwork(nn.Module):
         if config.reflectance:
             parts["reflectance"] = Part(NUM_REFLECTANCES, 1 + NUM_REFLECTANCES)
         self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, sum(self.outputs), parts)
-        self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
+        self.mask = MaskNetwork.behind(config.features, config.mask_width, self)
         preferred = torch.zeros(NUM_CANDIDATES)
         preferred[0] = _TRUST
         self.register_buffer("preferred", preferred[:, None, None], persistent=False)
 
     preferred: Tensor
-    azimuth: Tensor
+
+    def made_for(self, sensor: SensorModel) -> "CompletionNetwork":
+        """Return a new network of the same sizes for another sensor."""
+        return CompletionNetwork(self.config, sensor)
 
     def forward(self, classical: ClassicalFeatures, observed: Bool[Tensor, "B H W"]) -> CompletionOutput:
         """Return the estimate of every pixel.
@@ -131,8 +136,7 @@ class CompletionNetwork(nn.Module):
         Args:
             observed: True where it was observed whether there is a return.
         """
-        rows = self.rows[None, :, :, None].expand(len(observed), -1, -1, observed.shape[-1])
-        columns = self.azimuth[None, :, None].expand(len(observed), -1, observed.shape[-2], -1)
+        classical, observed = classical.mapped(self.padded), self.padded(observed)
         more: dict[str, Tensor] = {}
         seen, indices = classical.reflectances, None
         if self.classes is not None:
@@ -147,21 +151,23 @@ class CompletionNetwork(nn.Module):
                     (len(observed), NUM_REFLECTANCES, *observed.shape[1:]), TYPICAL_REFLECTANCE
                 )
             more["reflectance"] = seen - TYPICAL_REFLECTANCE
-        output, of_parts = self.unet(torch.cat((classical.maps, rows, columns), 1), more)
+        output, of_parts = self.unet(torch.cat((classical.maps, self.ray_maps(len(observed))), 1), more)
         features, weights, moved, logits = output.float().split(self.outputs, 1)
         shares = (4 * weights + self.preferred).softmax(1)
         v = (shares * classical.candidates).sum(1) + 0.3 * moved[:, 0]
         return_logits = (2 * logits[:, 0] + 1.5).clamp(-LOGIT_BOUND, LOGIT_BOUND)
         v = v.clamp(*self.limits_v)
-        class_logits, reflectance = None, None
+        class_logits, reflectance, own = None, None, slice(self.sensor.height)
         if indices is not None:
             alone, trust = of_parts["labels"].float().split([NUM_CLASSES, NUM_LABELS], 1)
             class_logits = 2 * alone + _VOTE * votes(indices, self._shares(trust, classical.candidates[:, LABELLED], v))
+            class_logits = class_logits[:, :, own]
         if self.config.reflectance and seen is not None:
             alone, trust = of_parts["reflectance"].float().split([1, NUM_REFLECTANCES], 1)
             reflectance = alone[:, 0] + (seen * self._shares(trust, classical.candidates[:, REFLECTING], v)).sum(1)
+            reflectance = reflectance[:, own]
         guide = Guide(features, v.detach(), return_logits.detach(), observed)
-        return CompletionOutput(guide, v, return_logits, class_logits, reflectance)
+        return CompletionOutput(guide, v[:, own], return_logits[:, own], class_logits, reflectance)
 
     def _shares(
         self, trust: Float[Tensor, "B S H W"], candidates: Float[Tensor, "B S H W"], v: Float[Tensor, "B H W"]
@@ -190,7 +196,8 @@ class CompletionNetwork(nn.Module):
                 self(classical.mirrored(), one.return_observed.flip(-1)),
             )
             v = (point.v + mirrored.v.flip(-1)) / 2
-            mask = self.mask.sample(point.guide, uniform[index : index + 1], one)
+            mask = self.mask.sample(point.guide, uniform[index : index + 1], self.padded_condition(one))
+            mask = mask[:, : self.sensor.height]
             low_m, high_m = condition.sensor.range_min_m, condition.sensor.range_max_m
             planes = dict[str, Tensor]()
             if classical.labels is not None and point.class_logits is not None and mirrored.class_logits is not None:

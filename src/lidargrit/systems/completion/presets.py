@@ -2,7 +2,8 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.presets import LATER_STAGE, MORE_STREETS, WIDE_STREETS, preset
+from lidargrit.generation.presets import ANY_SENSOR, LATER_STAGE, MORE_STREETS, WIDE_STREETS, preset
+from lidargrit.systems.completion.network import CompletionNetworkConfig
 from lidargrit.systems.completion.system import CompletionConfig
 
 _COMPLETION = replace(
@@ -21,6 +22,14 @@ PRESETS = {
         MORE_STREETS,
         CompletionConfig(),
         completion=_COMPLETION,
+    ),
+    "completion_any": preset(
+        "a network that completes scans of any spinning sensor: for one CPU core and half an hour",
+        ANY_SENSOR,
+        CompletionConfig(CompletionNetworkConfig(any_sensor=True)),
+        completion=replace(
+            _COMPLETION, scans=8000, learning_rate=8e-4, average_over_scans=300, start="pretrained/completion"
+        ),
     ),
     "completion_wide": preset(
         "a network that completes scans: 64x1024, for one CPU core and half an hour",

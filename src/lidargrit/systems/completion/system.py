@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.core.configuration import Settings
+from lidargrit.generation.any_sensor import told_rays_in_place_of_rows
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -42,12 +43,17 @@ class CompletionObjective(Objective):
     root of their hidden share.
     """
 
-    additions = frozenset({"labels", "reflectance"})
+    additions = frozenset({"labels", "reflectance", "any_sensor"})
     reaches_all_weights = False  # some phases stand for all
 
     def __init__(self, network: CompletionNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.completion = network
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained network, for any sensor without those of the rows of a single one."""
+        weights = super().weights_from(trained)
+        return told_rays_in_place_of_rows(weights, self) if self.completion.any_sensor else weights
 
     def check(self, images: RangeImage) -> None:
         """Refuse images without the labels or the reflectance that are to be learned."""
@@ -64,7 +70,8 @@ class CompletionObjective(Objective):
         absolute error.
         """
         images, rng = example.images, of_host(rng)
-        observed = random_patterns(len(images), self.sensor.height, self.sensor.width, rng)
+        network = self.completion.for_sensor(images.sensor)
+        observed = random_patterns(len(images), images.sensor.height, images.sensor.width, rng)
         # Features are searched for on the host, so all that they need is brought there once.
         condition, learned = Observed.of_pixels(images.to("cpu"), observed), self.completion.config
         planes = dict[str, Tensor]()  # no features are computed of what the network does not see
@@ -75,11 +82,12 @@ class CompletionObjective(Objective):
             planes["reflectance"] = hidden_in_some(shown, TYPICAL_REFLECTANCE, _WITHOUT, rng)
         condition = replace(condition, planes=planes)
         observed = observed.to(images.range_m.device)
-        point = self.completion(classical_features(condition, images.range_m.device), observed)
+        point = network(classical_features(condition, images.range_m.device), observed)
         hidden = ~observed
         returns = (hidden & images.return_mask).float()
         count, num_returns = hidden.sum((1, 2)).clamp(min=1), returns.sum((1, 2)).clamp(min=1)
-        nats = self.completion.mask.nats(point.guide, images.return_mask, rng if self.training else None) / count
+        true = network.padded(images.return_mask)
+        nats = network.mask.nats(point.guide, true, rng if self.training else None) / count
         alone = F.binary_cross_entropy_with_logits(point.return_logits, images.return_mask.float(), reduction="none")
         alone = (alone * hidden).sum((1, 2)) / count
         log_error = ((point.v - images.range_m.log1p()).abs() * returns).sum((1, 2)) / num_returns

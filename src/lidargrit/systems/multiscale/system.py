@@ -1,7 +1,6 @@
 """A pixel decoder without tokens: seeds → range images from coarse to fine, each phase given all earlier ones."""
 
 from dataclasses import dataclass, field
-from typing import Self
 
 from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
@@ -10,7 +9,6 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
-from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokens import PixelObjective
 from lidargrit.nn.random import rngs_of
@@ -42,16 +40,9 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
     Sampling = PixelSampling
     capabilities = frozenset({"complete", "likelihood"})
 
-    def __init__(self, config: MultiscaleConfig, sensor: SensorModel, pixels: PixelDecoder | None = None) -> None:
+    def __init__(self, config: MultiscaleConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.pixels = pixels or PixelDecoder(config.pixels, sensor, features=0)
-
-    def for_sensor(self, sensor: SensorModel) -> Self:
-        """Return the generator for any sensor within the bounds of training, if ``config.pixels.any_sensor`` is set."""
-        if not self.config.pixels.any_sensor:
-            return super().for_sensor(sensor)
-        check_bounds(sensor)
-        return type(self)(self.config, sensor, self.pixels.for_sensor(sensor)).train(self.training)
+        self.pixels = PixelDecoder(config.pixels, sensor, features=0)
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> MultiscaleConfig:

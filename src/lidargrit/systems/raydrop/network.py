@@ -7,18 +7,19 @@ from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count
+from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.planes import planes_of
-from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
+from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
 
 _EDGE = 0.5  # of ln(range): neighbours further apart lie on two surfaces
@@ -41,6 +42,8 @@ class RaydropNetworkConfig(Settings):
         features: channels that the phases of the mask see.
         mask_width: channels of the layers of the mask's phases.
         row_channels: learned numbers of every row.
+        any_sensor: whether the network is told the angles of each row, by a small perceptron, in place of numbers that
+            are learned row by row, so that the weights serve every spinning sensor.
         labels: whether the network sees the classes of the surfaces, where scans have them: the 19 classes of
             SemanticKITTI's benchmark.
         reflectance: whether the network estimates the reflectance of what returns.
@@ -52,6 +55,7 @@ class RaydropNetworkConfig(Settings):
     features: Count = 24
     mask_width: Count = 24
     row_channels: Count = 2
+    any_sensor: bool = False
     labels: bool = False
     reflectance: bool = False
 
@@ -69,7 +73,7 @@ class RaydropOutput(NamedTuple):
     """Output of the network for every ray.
 
     Args:
-        guide: inputs of the phases of the mask.
+        guide: inputs of the phases of the mask, with the network's absent rows.
         logits: logits of the probability of a return by itself, with their gradient.
         reflectance: reflectance if the surface returns, with its gradient, not yet limited to [0, 1]; None from a
             network without it.
@@ -80,17 +84,15 @@ class RaydropOutput(NamedTuple):
     reflectance: Float[Tensor, "B H W"] | None = None
 
 
-class RaydropNetwork(nn.Module):
+class RaydropNetwork(RayNetwork):
     """A small U-Net over the ranges of all surfaces, and a mask that is sampled in phases behind it."""
 
     def __init__(self, config: RaydropNetworkConfig, sensor: SensorModel) -> None:
-        super().__init__()
-        check_size(sensor.height, sensor.width, "a network of raydrop")
+        super().__init__(sensor, config.any_sensor)
+        check_size(self.grid.height, sensor.width, "a network of raydrop")
         self.config = config
-        self.rows = nn.Parameter(torch.zeros(config.row_channels, sensor.height))
-        azimuth_rad = mean_azimuths_rad(sensor.azimuth_rad).float()
-        self.register_buffer("azimuth", torch.stack((azimuth_rad.sin(), azimuth_rad.cos())), persistent=False)
-        elevation_rad = sensor.elevation_rad.double().mean(1).float()
+        self._tell_rays(config.row_channels)
+        elevation_rad = self.grid.elevation_rad.double().mean(1).float()
         self.register_buffer("elevation_rad", elevation_rad, persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks)
         self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
@@ -98,10 +100,13 @@ class RaydropNetwork(nn.Module):
         if config.reflectance:
             parts["reflectance"] = Part(0, 1)
         self.unet = SmallUnet(sizes, _NUM_MAPS + config.row_channels + 2, config.features + 1, parts)
-        self.mask = MaskNetwork.behind(config.features, config.mask_width, sensor)
+        self.mask = MaskNetwork.behind(config.features, config.mask_width, self)
 
-    azimuth: Tensor
     elevation_rad: Tensor
+
+    def made_for(self, sensor: SensorModel) -> "RaydropNetwork":
+        """Return a new network of the same sizes for another sensor."""
+        return RaydropNetwork(self.config, sensor)
 
     def forward(
         self,
@@ -115,12 +120,11 @@ class RaydropNetwork(nn.Module):
             surface: True where a ray meets a surface; no other ray returns.
             label: class of each surface, 0 where it is not known; of use to a network with classes.
         """
-        count, width = len(range_m), range_m.shape[-1]
-        rows = self.rows[None, :, :, None].expand(count, -1, -1, width)
-        columns = self.azimuth[None, :, None].expand(count, -1, range_m.shape[-2], -1)
-        maps, more = torch.cat((self._maps(range_m, surface), rows, columns), 1), dict[str, Tensor]()
+        range_m, surface = self.padded(range_m), self.padded(surface)
+        maps = torch.cat((self._maps(range_m, surface), self.ray_maps(len(range_m))), 1)
+        more, own = dict[str, Tensor](), slice(self.sensor.height)
         if self.classes is not None:
-            label = torch.zeros_like(surface, dtype=torch.int64) if label is None else label
+            label = torch.zeros_like(surface, dtype=torch.int64) if label is None else self.padded(label)
             more["labels"] = self.classes(class_indices(label)[:, None])
         output, of_parts = self.unet(maps, more)
         features, logits = output.float().split((self.config.features, 1), 1)
@@ -128,8 +132,8 @@ class RaydropNetwork(nn.Module):
         logits = (2 * logits[:, 0] + 1.5).clamp(-LOGIT_BOUND, LOGIT_BOUND)
         reflectance = None
         if self.config.reflectance:
-            reflectance = TYPICAL_REFLECTANCE + of_parts["reflectance"].float()[:, 0]
-        return RaydropOutput(Guide(features, v, logits.detach(), ~surface), logits, reflectance)
+            reflectance = TYPICAL_REFLECTANCE + of_parts["reflectance"].float()[:, 0, own]
+        return RaydropOutput(Guide(features, v, logits.detach(), ~surface), logits[:, own], reflectance)
 
     def sample(self, condition: Observed, rngs: Sequence[torch.Generator]) -> RangeImage:
         """Return the surfaces that return, of each scan by its own random numbers; ranges stay as they are.
@@ -144,7 +148,8 @@ class RaydropNetwork(nn.Module):
         for index in range(len(rngs)):
             one = condition[index : index + 1]
             found = self(one.range_m, one.range_observed, one.label)
-            returned = self.mask.sample(found.guide, uniform[index : index + 1], one)
+            returned = self.mask.sample(found.guide, uniform[index : index + 1], self.padded_condition(one))
+            returned = returned[:, : self.sensor.height]
             reflectance = None if found.reflectance is None else found.reflectance.clamp(0, 1)
             planes = planes_of(reflectance=reflectance, label=one.label)
             images.append(RangeImage.masked(one.range_m, returned, condition.sensor, planes))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.generation.any_sensor import told_rays_in_place_of_rows
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -35,13 +36,18 @@ _WITHOUT_LABELS = 0.25  # of the scans, so that a network with classes drops ret
 class RaydropObjective(Objective):
     """The likelihood of which surfaces return, in phases and pixel by pixel."""
 
-    additions = frozenset({"labels", "reflectance"})
+    additions = frozenset({"labels", "reflectance", "any_sensor"})
     reaches_all_weights = False  # some phases stand for all
 
     def __init__(self, network: RaydropNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.raydrop = network
         self.needs_marks = network.config.surfaces == "known"
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained network, for any sensor without those of the rows of a single one."""
+        weights = super().weights_from(trained)
+        return told_rays_in_place_of_rows(weights, self) if self.raydrop.any_sensor else weights
 
     def check(self, images: RangeImage) -> None:
         """Refuse images whose surfaces are not marked, or without the labels or the reflectance to be learned."""
@@ -62,13 +68,14 @@ class RaydropObjective(Objective):
         if self.training:
             noise = torch.randn(range_m.shape, generator=rng, device=rng.device)
             most = torch.rand((len(range_m), 1, 1), generator=rng, device=rng.device) * _NOISE_M
-            range_m = (range_m + noise * most).clamp(min=self.sensor.range_min_m)
+            range_m = (range_m + noise * most).clamp(min=images.sensor.range_min_m)
         label = None
         if self.raydrop.classes is not None:
             label = hidden_in_some(labels_to_learn(images.label), 0, _WITHOUT_LABELS, rng)
-        found = self.raydrop(range_m, surface, label)
+        network = self.raydrop.for_sensor(images.sensor)
+        found = network(range_m, surface, label)
         count = surface.float().sum((1, 2)).clamp(min=1)
-        nats = self.raydrop.mask.nats(found.guide, returned, rng if self.training else None) / count
+        nats = network.mask.nats(found.guide, network.padded(returned), rng if self.training else None) / count
         alone = F.binary_cross_entropy_with_logits(found.logits, returned.float(), reduction="none")
         alone = (alone * surface).sum((1, 2)) / count
         bits = {"mask_bits": nats.mean().detach() / math.log(2), "alone_bits": alone.mean().detach() / math.log(2)}
