@@ -114,6 +114,8 @@ def test_poses_of_kitti_are_those_of_the_lidar(tmp_path):
     known = read_trajectory(tmp_path / "drive/sequences/00")
     for known_pose, pose in zip(known.poses, way := poses_of(SEED, known.times_s.tolist(), VLP16), strict=True):
         np.testing.assert_allclose(known_pose, np.linalg.inv(way[0]) @ pose, atol=1e-6)
+    with pytest.raises(DataError, match=r"12 numbers in a row and no times; .*; name .*/drive/sequences/00$"):
+        read_trajectory(tmp_path / "drive/sequences/00/poses.txt")
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidargrit.core.errors import DataError
+from lidargrit.core.files import read_text
 from lidargrit.data.datasets.shared.odometry import motions, table
 from lidargrit.scans.motion import Trajectory
 
+_KITTI_COLUMNS = 12
 _TUM = "rows of 8 numbers: time in s, x, y, z in m, and a quaternion qx, qy, qz, qw"
 
 
@@ -31,6 +33,9 @@ def read_trajectory(path: Path) -> Trajectory:
     if not path.is_file():
         wanted = f"a folder with poses.txt, times.txt and calib.txt, or a file of {_TUM}"
         raise DataError(f"{path}, which is not there", wanted, "check the path")
+    if len(read_text(path).partition("\n")[0].split()) == _KITTI_COLUMNS:
+        wanted = f"the folder that holds it beside times.txt, or {_TUM}"
+        raise DataError(f"{path}, which has KITTI's 12 numbers in a row and no times", wanted, f"name {path.parent}")
     rows = table(path, 8, _TUM)
     if not bool((np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.01).all()):
         raise DataError(f"a quaternion of {path} whose length is not 1", _TUM, "restore the file")
