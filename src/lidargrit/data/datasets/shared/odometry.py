@@ -33,7 +33,9 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     times_s = table(sequence / "times.txt", 1, "one finite number of seconds in each row")[:, 0]
     if bool((np.diff(times_s) <= 0).any()):
         raise DataError(f"times that do not rise in {sequence / 'times.txt'}", "rising seconds", "restore the file")
-    cameras = table(sequence / "poses.txt", 12, _POSE).reshape(-1, 3, 4)
+    beside = sequence.parent.parent / "poses" / f"{sequence.name}.txt"  # as KITTI itself has them
+    own = sequence / "poses.txt"
+    cameras = table(own if own.exists() else beside, 12, _POSE).reshape(-1, 3, 4)
     poses = _homogeneous(cameras)
     if len(poses):
         camera_from_sensor = _camera_from_sensor(sequence / "calib.txt")
