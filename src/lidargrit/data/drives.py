@@ -101,13 +101,16 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
-        _write_sequence_files(out, config, there)  # first, so that what an interrupted call leaves is drives
+        if config.frames > 1:  # first, so that what an interrupted call leaves is drives
+            _write_sequence_files(out, config, there)
         missing = [scan for scan in range(there) if not _label_file(out, config, scan).exists()]
         size = _SHARE_ON_RAY if ray else _SHARE
         shares = [missing[first : first + size] for first in range(0, len(missing), size)]
         with reporting.progress("simulating", there, there - len(missing)) as progress:
             for count in each_done(partial(_write_scans, out, config), shares, workers, ray):
                 progress.advance(count)
+        if config.frames == 1:  # last, so that a sensor that sees nothing leaves the folder free
+            _write_sequence_files(out, config, there)
     return there
 
 
