@@ -41,7 +41,7 @@ def scan_at(points):
 @settings(max_examples=60, deadline=None)
 def test_projecting_an_unprojected_image_gives_it_back(name, method, seed, columns, share):
     image = random_image(load_sensor(name).with_columns(columns), seed, share)
-    again = project(unproject(image), image.sensor, method)
+    again = project(unproject(image), image.sensor, method, partial=True)  # few returns may leave a sector empty
     assert torch.equal(again.return_mask, image.return_mask)
     assert torch.allclose(again.range_m, image.range_m, rtol=1e-5, atol=0)
 
