@@ -1,12 +1,16 @@
 """Small sensors, and pixel decoders with what goes into them, none of whose numbers are trained."""
 
+import json
 import math
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import torch
 
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, SensorSetup
 from lidargrit.scans.types import Decoded, RangeImage
 
 FEATURES = 5
@@ -16,6 +20,14 @@ def tiny_sensor(rows: int, columns: int) -> SensorModel:
     elevation_rad = 0.05 - 0.4 * torch.linspace(0, 1, rows)[:, None] ** 1.2  # rows are not evenly spaced
     azimuth_rad = math.pi - 2 * math.pi * (torch.arange(columns) + 0.5)[None] / columns
     return SensorModel("tiny", elevation_rad, azimuth_rad, 1.0, 80.0, "spherical")
+
+
+def write_other_sensor(folder: Path) -> None:
+    """Write a sensor of 13 rows and 256 columns, ``mine.json``, and a scan of it in ``scans``."""
+    mine = replace(tiny_sensor(13, 256), name="mine", setup=SensorSetup(height_m=2.0))
+    (folder / "mine.json").write_text(json.dumps(mine.to_json()))
+    (folder / "scans").mkdir()
+    np.save(folder / "scans" / "one.npy", random_images(mine, 1).range_m[0].numpy())
 
 
 def random_decoder(

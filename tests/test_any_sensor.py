@@ -24,7 +24,7 @@ from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel, SensorSetup, load_sensor
 from lidargrit.systems.multiscale.system import Multiscale, MultiscaleConfig
-from pixel_decoder_examples import random_images, tiny_sensor
+from pixel_decoder_examples import random_images, tiny_sensor, write_other_sensor
 from seeded_images import SeededImages
 
 CONFIG = PixelDecoderConfig(16, row_channels=3, mask_width=6, range_width=6, blocks=1, any_sensor=True)
@@ -191,11 +191,7 @@ def run(tmp_path_factory):
     own = load_sensor("vlp16").with_columns(256)
     config = replace(CONFIG, surface_components=True, gravity_components=True)
     Multiscale(MultiscaleConfig(config), own).save(folder / "run")
-    other = tiny_sensor(13, 256)
-    mine = replace(other, name="mine", setup=SensorSetup(height_m=2.0))
-    (folder / "mine.json").write_text(json.dumps(mine.to_json()))
-    (folder / "scans").mkdir()
-    np.save(folder / "scans" / "one.npy", random_images(mine, 1).range_m[0].numpy())
+    write_other_sensor(folder)
     return folder
 
 

@@ -1,6 +1,5 @@
 """Completion and raydrop told their rays: the same weights on other rays, absent rows, commands for other sensors."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +17,7 @@ from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.nn.quantization import without_quantized
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
-from lidargrit.scans.sensors import SensorModel, SensorSetup, load_sensor
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.completion.classical_features import classical_features
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
@@ -26,7 +25,7 @@ from lidargrit.systems.completion.system import Completion, CompletionConfig
 from lidargrit.systems.raydrop.network import RaydropNetwork, RaydropNetworkConfig
 from lidargrit.systems.raydrop.system import Raydrop, RaydropConfig
 from lidargrit.training.taken_stages import taken_stages
-from pixel_decoder_examples import random_images, tiny_sensor
+from pixel_decoder_examples import random_images, tiny_sensor, write_other_sensor
 
 EVEN, ODD = tiny_sensor(16, 32), tiny_sensor(13, 24)  # the second has 3 absent rows
 COMPLETION = CompletionNetworkConfig(
@@ -227,10 +226,7 @@ def runs(tmp_path_factory):
     own = load_sensor("vlp16").with_columns(256)
     generator("completion", own).save(folder / "completion")
     generator("raydrop", own).save(folder / "raydrop")
-    mine = replace(tiny_sensor(13, 256), name="mine", setup=SensorSetup(height_m=2.0))
-    (folder / "mine.json").write_text(json.dumps(mine.to_json()))
-    (folder / "scans").mkdir()
-    np.save(folder / "scans" / "one.npy", random_images(mine, 1).range_m[0].numpy())
+    write_other_sensor(folder)
     return folder
 
 

@@ -113,7 +113,7 @@ def footprint(directions: Float32[np.ndarray, "n 3"], divergence_rad: float) -> 
 @lru_cache(maxsize=4)  # a sensor is asked for many scans in a row
 def _aims(sensor: SensorModel) -> tuple[np.ndarray, ...]:
     """Return elevation, azimuth, turn, phase in columns, and what the carrier leaves clear, of all fine columns."""
-    per_pixel = sensor.elevation_rad.shape[1] > 1 or sensor.azimuth_rad.shape[0] > 1
+    per_pixel = sensor.has_angles_per_pixel
     fine = sensor if per_pixel else sensor.fine()
     azimuth, elevation = fine.azimuth_rad.double().numpy(), fine.elevation_rad.double().numpy()
     phase, turn = np.zeros((1, 1)), azimuth / (2 * math.pi) % 1

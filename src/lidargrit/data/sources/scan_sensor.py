@@ -38,8 +38,7 @@ def refuse_other_sensor(settings: ScanSettings, model: str, job: Job = "sample")
         return
     own = RunSource(model, locate(model, job)).sensor
     sensor = settings.load_sensor() or settings.data.with_projection(own.fine())
-    has_columns = sensor.elevation_rad.shape[1] == 1 and sensor.azimuth_rad.shape[0] == 1
-    if not settings.data.columns and sensor.name == own.name and has_columns:
+    if not settings.data.columns and sensor.name == own.name and not sensor.has_angles_per_pixel:
         sensor = sensor.with_columns(own.width * own.column_stride, own.column_stride)
     if not own.same_rays(sensor):
         raise other_sensor(sensor, own, model, settings.sensor)

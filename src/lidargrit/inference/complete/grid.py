@@ -43,7 +43,7 @@ class RayGrid:
             columns: number of columns in which the cloud's sensor fires; the model's fine ones where it is 0, unknown.
             first_edge_rad: azimuth at which the first of these columns begins; that of the model if not given.
         """
-        if model.elevation_rad.shape[1] > 1 or model.azimuth_rad.shape[0] > 1:  # angles for every pixel: no others
+        if model.has_angles_per_pixel:  # no others
             return cls(model, model)
         phases = math.floor(columns / model.width + _ALMOST) if columns else model.column_stride
         phases = min(max(phases, 1), _PHASES_AT_MOST)

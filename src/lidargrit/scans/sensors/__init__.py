@@ -99,6 +99,11 @@ class SensorModel:
         horizontal = elevation.cos()
         return torch.stack((horizontal * azimuth.cos(), horizontal * azimuth.sin(), elevation.sin()), dim=-1)
 
+    @property
+    def has_angles_per_pixel(self) -> bool:
+        """Whether pixels have angles of their own, not one elevation a row and one azimuth a column."""
+        return self.elevation_rad.shape[1] > 1 or self.azimuth_rad.shape[0] > 1
+
     def with_columns(self, columns: int, stride: int = 1) -> "SensorModel":
         """Return this sensor with ``columns // stride`` columns: every ``stride``-th of ``columns`` equal ones.
 
@@ -111,7 +116,7 @@ class SensorModel:
                 f"a multiple of the stride from 1 to {FINE_COLUMNS_AT_MOST}",
                 "change one of the two",
             )
-        if self.elevation_rad.shape[1] > 1 or self.azimuth_rad.shape[0] > 1:
+        if self.has_angles_per_pixel:
             raise ConfigError(
                 f"another number of columns for {self.name!r}, which has angles for every pixel",
                 "a sensor with one elevation a row and one azimuth a column",

@@ -75,7 +75,7 @@ class Streets(ScanDataset):
 
     def recording(self, index: int) -> str:
         """Name the street of a scan by the version of the streets and its seed, which no other scan shares."""
-        return f"simulated/streets {STREETS_VERSION}/seed_{self.seeds[index]:07d}"
+        return f"simulated/streets {STREETS_VERSION}/{Streets.name(self, index)}"
 
     @classmethod
     def matches(cls, root: Path) -> bool:
