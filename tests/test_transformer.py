@@ -109,6 +109,42 @@ def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, toler
     assert float((whole - stepwise).abs().max()) < tolerance
 
 
+def tokens_around_by_loop(transformer, read, columns):
+    """Return what the tokens around add at each position, one position and one neighbour at a time."""
+    length, added = read.shape[1], torch.zeros(*read.shape, transformer.config.width)
+    for position in range(length):
+        row, column = divmod(position, columns)
+        for number, (up, left) in enumerate(
+            [(0, 2), (0, 3), (1, 2), (1, 1), (1, 0), (1, -1), (1, -2), (2, 1), (2, 0), (2, -1), (3, 0)]
+        ):
+            if row - up < 0 or (up == 0 and column - left < 0):
+                continue
+            place = (row - up) * columns + (column - left) % columns
+            token = read[:, place + 1]  # the first is the start token
+            added[:, position] += transformer.tok_emb.weight[token] @ transformer.around.maps[number]
+    return added
+
+
+@pytest.mark.parametrize("static", [False, True])
+def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_them(static):
+    torch.manual_seed(0)
+    config = TransformerConfig(layers=2, heads=2, width=16, embedding_dropout=0.0, neighbours=True)
+    transformer = CausalTransformer(config, num_tokens=20, context_length=24, columns=6).eval()
+    torch.nn.init.normal_(transformer.tok_emb.weight, std=0.5)
+    torch.nn.init.normal_(transformer.head.weight, std=0.5)
+    uniform = torch.rand((3, 24), generator=torch.Generator().manual_seed(1))
+    sampled = generate(transformer, uniform, TokenSampling(), static=static)
+    with torch.no_grad():
+        read = after_start(sampled[:, :-1])
+        plain = transformer.tok_emb(read) + transformer.pos_emb
+        around = transformer.embedded(read) - plain
+        assert torch.allclose(around, tokens_around_by_loop(transformer, read, 6), atol=1e-5)
+        assert torch.allclose(transformer(read[:, :9]), transformer(read)[:, :9], atol=1e-5)  # of a shorter sequence
+        logits = transformer(read)
+    chosen = [sample_token(logits[:, i], uniform[:, i], TokenSampling()) for i in range(24)]
+    assert torch.equal(torch.stack(chosen, 1), sampled)
+
+
 @pytest.mark.parametrize(("layers", "unattending"), [(1, 0), (2, 0), (4, 2)])
 @pytest.mark.parametrize("static", [False, True])
 def test_guidance_moves_logits_away_from_those_without_the_attention_of_the_last_block_but_one(

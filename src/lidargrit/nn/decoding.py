@@ -85,6 +85,9 @@ class CachedDecoder:
         heads, width = transformer.config.heads, transformer.config.width
         self._embedding = transformer.tok_emb.weight.detach().to(dtype)
         self._positions = transformer.pos_emb[0].detach().to(dtype)
+        self._around = transformer.around
+        tables = None if self._around is None else self._around.tables(transformer.tok_emb.weight).detach()
+        self._tables = torch.empty(0) if tables is None else tables.to(dtype)
         self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
         self._guidance, self._weaker = guidance, self._blocks[-2:] if guidance != 1 else []
         self._last_norm = _norm(transformer.ln_f, dtype)
@@ -129,7 +132,7 @@ class CachedDecoder:
                 for step in range(length):
                     chosen = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
                     self._tokens = torch.where(observed[:, step] < 0, chosen, observed[:, step])
-                    self._generated[:, step] = self._tokens
+                self._generated[:, length - 1] = self._tokens
         return self._generated[:, :length].clone()
 
     @torch.no_grad()
@@ -140,8 +143,20 @@ class CachedDecoder:
         def write_cache(layer: int) -> None:
             slots[layer].copy_(self._newest)
 
-        x = F.embedding(tokens, self._embedding) + self._positions[position]
+        if position:
+            self._generated[:, position - 1] = tokens
+        x = self._embedded(tokens, self._positions[position], torch.tensor([position], device=self._device))
         return self._logits(x, self._cache[:, :, :, : position + 1], write_cache)
+
+    def _embedded(self, tokens: Tensor, own: Tensor, position: Tensor) -> Tensor:
+        """Return the sum of what the previous token, the position and the tokens around it are embedded as."""
+        x = F.embedding(tokens, self._embedding) + own
+        if self._around is None:
+            return x
+        places = self._around.places.index_select(0, position)[0]  # behind the start token; the last is none
+        around = F.pad(self._generated, (1, 0)).index_select(1, places)
+        around = torch.where(places < self._length, around, -1)
+        return x + self._around.added(around, self._tables)
 
     def _logits(
         self, x: Tensor, past: Tensor, write_cache: Callable[[int], None], future: Tensor | None = None
@@ -177,7 +192,7 @@ class CachedDecoder:
         def write_cache(layer: int) -> None:
             slots[layer].index_copy_(3, self._position, self._newest.unsqueeze(3))
 
-        x = F.embedding(self._tokens, self._embedding) + self._positions.index_select(0, self._position)
+        x = self._embedded(self._tokens, self._positions.index_select(0, self._position), self._position)
         future = torch.arange(num_positions, device=self._device) > self._position
         logits = self._logits(x, self._cache[:, :, :, :num_positions], write_cache, future)
         chosen = self._sample_token(logits, self._uniform.index_select(1, self._position)[:, 0])

@@ -4,6 +4,7 @@ They read whole sequences; ``nn.decoding`` generates token by token with the sam
 reference's state dict (a minGPT), so that published weights load.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -53,6 +54,7 @@ def attend(
     return torch.cat(mixed, -2)
 
 
+_AROUND = ((0, -2), (0, -3), *((-1, right) for right in range(-2, 3)), (-2, -1), (-2, 0), (-2, 1), (-3, 0))
 _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
 
 
@@ -66,6 +68,8 @@ class TransformerConfig(Settings):
         width: length of the vector that stands for a token.
         embedding_dropout: probability of dropout on the embedded tokens.
         residual_dropout: probability of dropout on the output of each block's two branches.
+        neighbours: whether a position also reads the tokens around it in the grid that come before it, where the paper
+            gives it the previous token alone and leaves it to attention to learn where the row above lies.
     """
 
     layers: Annotated[int, Bounds(1, _LAYERS_AT_MOST)] = 6
@@ -73,6 +77,7 @@ class TransformerConfig(Settings):
     width: Count = 256
     embedding_dropout: ShareBelow1 = 0.2
     residual_dropout: ShareBelow1 = 0.0
+    neighbours: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -109,23 +114,85 @@ class Transformer(Network):
 
     def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
         """Return the logits at each position: of the next token if causal, else of the position's own."""
-        x = self.drop(self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]])
+        x = self.drop(self.embedded(tokens))
         for block in self.blocks:
             x = block(x)
         return self.head(self.ln_f(x))
 
+    def embedded(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T C"]:
+        """Return what the blocks read."""
+        return self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]]
+
+
+class TokensAround(nn.Module):
+    """What the tokens around a position add to its embedding, each by a linear map of its own.
+
+    They are those of the grid up to three rows above and three columns to the left; columns wrap around. The next token
+    depends on these most, and a short training finds that sooner than by attention over learned positions.
+
+    Args:
+        grid_size: rows and columns of the grid, whose tokens come row by row.
+        width: length of the vector that stands for a token.
+
+    Source:
+        van den Oord et al., Pixel Recurrent Neural Networks, 2016, for the neighbours that come before a pixel.
+    """
+
+    places: Tensor
+
+    def __init__(self, grid_size: tuple[int, int], width: int) -> None:
+        super().__init__()
+        self.maps = nn.Parameter(torch.randn(len(_AROUND), width, width) * width**-0.5)
+        # Of each position, the places of its neighbours in a sequence that begins with the start token.
+        row, column = torch.arange(grid_size[0])[:, None, None], torch.arange(grid_size[1])[:, None]
+        down, right = torch.tensor(_AROUND).unbind(1)
+        absent = (row + down < 0) | ((down == 0) & (column + right < 0))
+        place = (row + down) * grid_size[1] + (column + right) % grid_size[1] + 1
+        places = torch.where(absent, math.prod(grid_size), place).flatten(0, 1)
+        self.register_buffer("places", places, persistent=False)
+
+    def tables(self, embedding: Float[Tensor, "K C"]) -> Float[Tensor, "R C"]:
+        """Return what every token adds at every place around, and last 0 for a place outside of the grid."""
+        mapped = torch.einsum("kc,ncd->nkd", embedding, self.maps).flatten(0, 1).to(embedding.dtype)
+        return torch.cat((mapped, mapped.new_zeros(1, mapped.shape[1])))
+
+    def forward(self, tokens: Int[Tensor, "B T"], tables: Float[Tensor, "R C"]) -> Float[Tensor, "B T C"]:
+        """Return what is added at each position of sequences that begin with the start token."""
+        known = F.pad(tokens, (0, len(self.places) + 1 - tokens.shape[1]), value=-1)
+        return self.added(known[:, self.places[: tokens.shape[1]]], tables)
+
+    def added(self, around: Int[Tensor, "*B N"], tables: Float[Tensor, "R C"]) -> Float[Tensor, "*B C"]:
+        """Return the sum over the tokens around; -1 is none."""
+        offsets = torch.arange(len(_AROUND), device=around.device) * (len(tables) // len(_AROUND))
+        rows = torch.where(around < 0, len(tables) - 1, around + offsets)
+        return F.embedding_bag(rows.flatten(0, -2), tables, mode="sum").unflatten(0, around.shape[:-1])
+
 
 class CausalTransformer(Transformer):
-    """Predicts, at every position of a sequence, the token that follows."""
+    """Predicts, at every position of a sequence, the token that follows.
 
-    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
+    Args:
+        columns: columns of the grid whose tokens the sequence is, row by row; 0 for a sequence of one row.
+    """
+
+    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int, columns: int = 0) -> None:
         super().__init__(config, num_tokens, num_tokens, context_length, causal=True)
+        grid_size = (context_length // columns, columns) if columns else (1, context_length)
+        self.around = TokensAround(grid_size, config.width) if config.neighbours else None
+
+    def embedded(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T C"]:
+        """Return what the blocks read."""
+        x = super().embedded(tokens)
+        return x if self.around is None else x + self.around(tokens, self.around.tables(self.tok_emb.weight))
 
 
 class MaskedTransformer(Transformer):
     """Predicts the tokens of a sequence that are hidden, which it reads as ``mask_token``."""
 
     def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
+        if config.neighbours:
+            cure = "leave it out, or take a generator of tokens one by one"
+            raise ConfigError("model.transformer.neighbours=true of masked tokens", "false", cure)
         super().__init__(config, num_tokens + 1, num_tokens, context_length, causal=False)
         self.mask_token = num_tokens
 

@@ -24,6 +24,8 @@ _CODES_AT_MOST = 65_536
 _SHIFTS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
 _FINEST_M, _COARSEST_M = 0.01, 40.0
 _COMPONENTS_TOLD = 4  # the likeliest, to a pixel decoder; each costs it as much as a neighbour's range
+_TOLD = 2  # features of a pixel that are not learned: whether its part, and whether its cell, is at the nearest range
+_HEAD_START, _OF_PART = 4.0, 4.0  # of the logit of the own cell's range, and how much a pixel's part moves it
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
             )
         self.num_codes = config.num_codes
         self.grid_size = (sensor.height // rows, sensor.width // columns)
-        self.num_features, self.num_components = config.features, _COMPONENTS_TOLD
+        self.num_features, self.num_components = config.features + _TOLD, _COMPONENTS_TOLD
         self._low, self._high = math.log(sensor.range_min_m), math.log(sensor.range_max_m)
         components = len(_SHIFTS) + 1
         inputs = 2 + config.part_rows * config.part_columns
@@ -101,11 +103,12 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         self.conv_in = Convolution(inputs, config.width, "wrap")
         self.blocks = nn.Sequential(*(Residual(config.width) for _ in range(config.blocks)))
         self.to_pixels = nn.Conv2d(config.width, config.features * rows * columns, 1)
-        self.conv_out = nn.Conv2d(config.features, 3 * components + 1, 1)
+        self.conv_out = nn.Conv2d(self.num_features, 3 * components + 1, 1)
         nn.init.zeros_(self.conv_out.weight)
-        with torch.no_grad():  # a pixel is at its own cell's range until something else is learned
-            bias = torch.zeros(3, components)
-            bias[0, _SHIFTS.index((0, 0))] = 4.0
+        with torch.no_grad():  # a pixel is at its own cell's range, the more if its part is, until more is learned
+            bias, own = torch.zeros(3, components), _SHIFTS.index((0, 0))
+            bias[0, own] = _HEAD_START
+            self.conv_out.get_parameter("weight")[own, -_TOLD] = _OF_PART
             self.conv_out.get_parameter("bias").copy_(torch.cat((bias.flatten(), torch.tensor([2.0]))))
 
     def encode(self, images: RangeImage) -> TokenGrid:
@@ -175,6 +178,13 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         parts = chosen.unflatten(-1, (self.config.part_columns, -1)).unflatten(-3, (self.config.part_rows, -1))
         return parts.sum((-3, -1)).flatten(-2).float()
 
+    def _of_pixels(self, parts: Bool[Tensor, "B h w parts"]) -> Float[Tensor, "B H W"]:
+        """Return for every pixel the value of its part of its cell; a single part is the cell."""
+        config, single = self.config, parts.shape[-1] == 1
+        down, right = (1, 1) if single else (config.part_rows, config.part_columns)
+        maps = parts.unflatten(-1, (down, right)).permute(0, 1, 3, 2, 4).flatten(3, 4).flatten(1, 2).float()
+        return maps.repeat_interleave(config.cell_rows // down, 1).repeat_interleave(config.cell_columns // right, 2)
+
     def _decoded(
         self, tokens: Int[Tensor, "B h w"]
     ) -> tuple[RangeMixture, Float[Tensor, "B H W"], Float[Tensor, "B F H W"]]:
@@ -189,6 +199,8 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         x = F.silu(self.blocks(self.conv_in(maps) + self.rows))
         cells = self.to_pixels(x).unflatten(1, (config.features, config.cell_rows, config.cell_columns))
         features = F.silu(cells.permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3))
+        told = torch.stack((self._of_pixels(at_nearest), self._of_pixels(returned[..., None])), 1) - 0.5
+        features = torch.cat((features, told.to(features.dtype)), 1)
         output = self.conv_out(features).float()
         return self._mixture(output[:, :-1], torch.where(returned, log_range, torch.nan)), output[:, -1], features
 

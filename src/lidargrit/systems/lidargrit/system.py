@@ -102,7 +102,8 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
         height, width = self.tokenizer.grid_size
-        self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, height * width)
+        sizes = config.transformer, self.tokenizer.num_codes, height * width
+        self.transformer = CausalTransformer(*sizes, columns=width)
         self._decoder_cache: _DecoderCache | None = None
         self._one_at_a_time = threading.Lock()
 
