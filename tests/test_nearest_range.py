@@ -1,6 +1,7 @@
 """Tokens of the nearest range of each cell: what they name, and what is decoded of them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.pixel_phases import at_phases
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.nearest_range import NearestRangeConfig, NearestRangeTokenizer
@@ -135,6 +137,43 @@ def test_a_pixel_decoder_is_no_worse_than_the_distribution_that_the_tokens_tell_
         per_return = pixels(decoded, images).range.sum() / images.return_mask.sum()
         of_tokens = tokenizer(Example(images), torch.Generator())["range_nats"]
     assert float(per_return) < float(of_tokens) + 0.1
+
+
+def test_what_neighbours_suggest_is_weighed_by_the_probability_that_the_tokens_give_it():
+    tokenizer, images = NearestRangeTokenizer(CONFIG, SENSOR).eval(), a_pole_before_a_wall()
+    sizes = SENSOR, tokenizer.num_features, tokenizer.num_components
+    plain, weighed = PixelDecoder(PIXELS, *sizes).eval(), PixelDecoder(replace(PIXELS, weighed_components=True), *sizes)
+    weighed.load_state_dict(plain.state_dict())
+    phases = plain.range.by_lattice()[-1]
+    with torch.no_grad():
+        decoded = tokenizer.decode(tokenizer.encode(images))
+        of = []
+        for pixels in (plain, weighed.eval()):
+            guide = pixels.guide(decoded, 1)
+            guided = pixels.range.guided(guide)
+            of.append(pixels.range.distributions(phases, guided, guide, images.return_mask, images.range_m.log1p()))
+        components = torch.stack([decoded.components[(..., *phase.pixels)] for phase in phases])
+    added, pole = of[1].logits - of[0].logits, at_phases(images.range_m == 9, phases)
+    own = slice(0, added.shape[-1] - tokenizer.num_components)  # those that are not decoded
+    assert not added[..., own.stop :].any()
+    for phase, scan, row, column in pole.nonzero().tolist()[::7]:
+        logits, centres, log_scales = components[phase, scan, :, :, row, column].double()
+        for number in range(own.start, own.stop):
+            ends = [
+                (float(of[0].centres[phase, scan, row, column, number]) + side - centres) / log_scales.exp()
+                for side in (-0.1, 0.1)
+            ]
+            below, above = (1 / (1 + (-end).exp()) for end in ends)
+            expected = math.log(float((logits.softmax(0) * (above - below)).sum()) + 1e-3)
+            assert float(added[phase, scan, row, column, number]) == pytest.approx(expected, abs=1e-3)
+    walls = (of[1].centres.expm1() > 20)[..., own]
+    share = [float((mixture.logits.softmax(-1)[..., own] * walls).sum(-1)[pole].mean()) for mixture in of]
+    assert share[1] < 0.25 * share[0]
+
+
+def test_candidates_are_not_weighed_where_nothing_is_decoded_by_which_they_could_be():
+    with pytest.raises(ConfigError, match="weighed_components without decoded_components"):
+        PixelDecoderConfig(weighed_components=True)
 
 
 def test_the_mode_of_a_mixture_is_its_densest_centre():

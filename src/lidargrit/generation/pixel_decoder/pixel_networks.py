@@ -67,6 +67,9 @@ class PixelDecoderConfig(Settings):
             assume that the sensor is level.
         decoded_components: whether more components are those of the range's distribution that the tokenizer decodes,
             or one at its decoded range where it decodes no distribution; they are corrected as the mask's logits are.
+        weighed_components: whether all other components are weighed by the probability that the decoded distribution
+            gives to ranges near them, so that a wall does not take the pixels of a pole of which the tokens tell; needs
+            ``decoded_components``.
         any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
             are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
             largest, and smaller images begin with smaller cells.
@@ -87,12 +90,16 @@ class PixelDecoderConfig(Settings):
     surface_components: bool = False
     gravity_components: bool = False
     decoded_components: bool = False
+    weighed_components: bool = False
     any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
 
     def __post_init__(self) -> None:
         super().__post_init__()
         phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
+        if self.weighed_components and not self.decoded_components:
+            got = "weighed_components without decoded_components"
+            raise ConfigError(got, "both, or neither", "set decoded_components=true")
         if self.any_sensor and (self.column_halvings or self.row_halvings):
             got = f"any_sensor with column_halvings={self.column_halvings} and row_halvings={self.row_halvings}"
             raise ConfigError(got, "square cells, which all sensors share", "leave them out, or any_sensor")

@@ -19,7 +19,7 @@ _NODES = tuple(
     (s * s * (3 - 2 * s), 3 * s * (1 - s) * float(weight))
     for s, weight in (((1 + float(at)) / 2, weight) for at, weight in zip(*leggauss(8), strict=True))
 )
-_SURFACE_V = 0.1  # half the width of a surface in v: a tenth of its range
+SURFACE_V = 0.1  # half the width of a surface in v: a tenth of its range
 _LARGEST_EXPONENT = 80.0  # its exponential stays finite in 32 bits
 _PAIRS_ON_CPU, _PAIRS_ON_GPU = 1 << 17, 1 << 28  # at once: half a megabyte, in the cache, and a gigabyte
 _LEAST_MASS = 1e-6  # of a component within the limits; the logarithm stays finite
@@ -132,7 +132,7 @@ class RangeMixture:
     def _tempered_logits(self, temperature: float) -> Float[Tensor, "*P K"]:
         """Return the logits of the components' weights at a temperature T of the density on each surface.
 
-        The surface of a component is what lies within ``_SURFACE_V`` of its centre. The component's weight is
+        The surface of a component is what lies within ``SURFACE_V`` of its centre. The component's weight is
         multiplied by d^(1/T - 1) of the density d at its centre, and divided by the mean of that power over the
         surface: over all components, each counted by its probability there, cut-offs left out. So components compete
         with those that reach the same surface: a pole loses little to the wall behind it, and only where it is so broad
@@ -199,8 +199,8 @@ class _Pairs:
         return _finite_log(s.addcmul_(s, s, value=-1).mul_(self._heights).sum(0))  # the logistic density: s (1 - s)
 
     def mass_near_centres(self) -> Float[Tensor, "K P K"]:
-        """Return the probability of each other component within ``_SURFACE_V`` of a component's centre."""
-        half = _SURFACE_V * self._steepness
+        """Return the probability of each other component within ``SURFACE_V`` of a component's centre."""
+        half = SURFACE_V * self._steepness
         there = (self._distance + half).sigmoid_()
         return there.sub_((self._distance - half).sigmoid_()).mul_(self._weights)
 

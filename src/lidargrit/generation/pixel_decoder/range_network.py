@@ -16,7 +16,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     pixels_around,
 )
 from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
-from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
+from lidargrit.generation.pixel_decoder.range_mixture import SURFACE_V, RangeMixture
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE
 
@@ -24,6 +24,7 @@ _FREE_COMPONENTS = 4  # of a range's distribution, begin at the decoded range; o
 _DECODED_HEAD_START = 4.0  # of the logits of decoded components: before training they are nearly all there is
 _UNEXPECTED = 1e-4  # probability of any range at all, by a network for any sensor: its bits have a bound
 _UNIFORM_LOG_SCALE = 1.0  # of such a range, in v: nearly flat between the limits
+_LEAST_AGREEMENT = 1e-3  # what the decoded distribution rules out may be right all the same
 _NEAR_V = 0.01  # a difference in v that is half of a large one: a hundredth of the range
 _FINEST_M, _COARSEST_M = math.exp(-6), math.exp(4)  # scales of a component: 2.5 mm to 55 m
 
@@ -56,6 +57,7 @@ class RangeNetwork(PhaseNetwork):
         widths = (config.range_width, config.coarse_range_width or config.range_width)
         super().__init__(config, sensor, features, config.range_features, widths, 3 * components, num_rows)
         self.suggest, self.decoded, self.any_sensor = suggest, decoded, config.any_sensor
+        self.weighs = config.weighed_components
         self.limits_m = (sensor.range_min_m, sensor.range_max_m)
         spread = torch.linspace(-0.2, 0.2, _FREE_COMPONENTS)
         scale = torch.cat((torch.zeros(_FREE_COMPONENTS), torch.full((suggest.count,), -2.0), torch.zeros(decoded)))
@@ -79,7 +81,9 @@ class RangeNetwork(PhaseNetwork):
         if self.decoded and guide.components is not None:
             decoded = torch.stack([guide.components[(..., *phase.pixels)] for phase in phases])
         contexts = self.context(phases, guide, return_mask, v, candidates, decoded)
-        return self.mixture(self.outputs(phases, guided, contexts), candidates, decoded)
+        output = self.outputs(phases, guided, contexts)
+        told = None if guide.told is None else at_phases(guide.told, phases)
+        return self.mixture(output, candidates, decoded, told)
 
     def context(
         self,
@@ -134,6 +138,7 @@ class RangeNetwork(PhaseNetwork):
         output: Float[Tensor, "P B O h w"],
         candidates: Float[Tensor, "P B K h w"],
         decoded: Float[Tensor, "P B 3 D h w"] | None = None,
+        told: Bool[Tensor, "P B h w"] | None = None,
     ) -> RangeMixture:
         """Return the distributions of the ranges of the pixels of phases of one lattice.
 
@@ -141,6 +146,7 @@ class RangeNetwork(PhaseNetwork):
             output: output of the network: logits, how far the centres move, and the scales.
             candidates: suggestions of the neighbours, and last the range that is expected without them.
             decoded: components of the decoded distribution, if the network corrects any.
+            told: True where something was decoded; None if it was everywhere.
         """
         logits, moved, scales = output.chunk(3, 2)
         free = candidates[:, :, -1:] + 2 * (moved[:, :, :_FREE_COMPONENTS] + self.begin)
@@ -154,6 +160,10 @@ class RangeNetwork(PhaseNetwork):
         anchored = torch.cat(centres[1:], 2) + 0.1 * moved[:, :, _FREE_COMPONENTS:]
         low, high = (math.log1p(limit) for limit in self.limits_m)
         centres = torch.cat((free, anchored), 2).clamp(low, high)
+        if self.weighs and decoded is not None:
+            agreement = _agreement(centres[:, :, : -self.decoded], decoded)
+            agreement = agreement if told is None else agreement * told[:, :, None]
+            logits = logits + F.pad(agreement, (0, 0, 0, 0, 0, self.decoded))
         log_scales_m = scales.clamp(math.log(_FINEST_M), math.log(_COARSEST_M))
         log_scales = log_scales_m - centres  # dv = d range / (1 + range): so the scale is one in metres
         if self.any_sensor:
@@ -163,6 +173,15 @@ class RangeNetwork(PhaseNetwork):
             log_scales = torch.cat((log_scales, torch.full_like(any_range, _UNIFORM_LOG_SCALE)), 2)
         logits, centres, log_scales = (part.movedim(2, -1).contiguous() for part in (logits, centres, log_scales))
         return RangeMixture(logits, centres, log_scales, self.limits_m)
+
+
+def _agreement(around: Float[Tensor, "P B K h w"], decoded: Float[Tensor, "P B 3 D h w"]) -> Float[Tensor, "P B K h w"]:
+    """Return the logarithm of the probability that a decoded distribution gives to ranges near each centre."""
+    logits, centres, log_scales = (part[:, :, None] for part in decoded.unbind(2))
+    inverse = (-log_scales).exp()
+    distance, half = (around[:, :, :, None] - centres) * inverse, SURFACE_V * inverse
+    near = (distance + half).sigmoid() - (distance - half).sigmoid()
+    return ((logits.softmax(3) * near).sum(3) + _LEAST_AGREEMENT).log()
 
 
 def _near(apart: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:

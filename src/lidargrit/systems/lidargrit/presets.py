@@ -209,16 +209,17 @@ PRESETS = {
         },
     ),
     "lidargrit_fine_wide": preset(
-        "LidarGRIT with a pixel decoder: 64x1024 in 2,048 tokens of nearest ranges, for half an hour of a GPU",
+        "LidarGRIT with a pixel decoder: 64x1024 in 4,096 tokens of nearest ranges, for half an hour of a GPU",
         replace(shared.WIDE_STREETS, train=("simulated:70000:train",), workers=16),
         LidarGritConfig(
-            NearestRangeConfig(cell_rows=8, cell_columns=4, part_rows=1, part_columns=4),
+            NearestRangeConfig(cell_rows=4, cell_columns=4, part_rows=1, part_columns=4),
             TransformerConfig(embedding_dropout=0.0),
             replace(
                 shared.PIXEL_DECODER,
                 mask_features=6,
                 coarse_range_width=48,
                 decoded_components=True,
+                weighed_components=True,
                 range_temperature=0.2,
             ),
         ),

@@ -251,7 +251,8 @@ def _level(config: PyramidConfig, number: int, sensors: list[SensorModel]) -> Le
         if rows != columns:
             side = "column_halvings" if columns > rows else "row_halvings"
             halvings[side] = (max(rows, columns) // min(rows, columns)).bit_length() - 1
-        top = replace(coarse, range_width=config.top_range_width, decoded_components=False, **halvings)
+        nothing_told = {"decoded_components": False, "weighed_components": False}
+        top = replace(coarse, range_width=config.top_range_width, **nothing_told, **halvings)
         return Level(sensor, replace(top, coarsest_cell=min(rows, columns)), None)
     halvings = min(_ROW_HALVINGS, ((sensor.height & -sensor.height) // 2).bit_length() - 1)
     decoder = replace(coarse if number else finest, coarsest_cell=2, column_halvings=0, row_halvings=halvings)
