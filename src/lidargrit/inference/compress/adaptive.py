@@ -64,7 +64,8 @@ class Counts:
         counts = self._counts[context]
         found = coder.decisions(counts[:, 1] * ONE // (counts[:, 0] + counts[:, 1]), outcome)
         np.add.at(self._counts, (context, found.astype(np.int64)), self._weight)
-        if (many := self._counts.sum(1) > _COUNTED).any():  # what is long ago counts less
+        many = context[self._counts[context].sum(1) > _COUNTED]
+        if len(many):  # what is long ago counts less
             self._counts[many] = (self._counts[many] + 1) // 2
         return found
 

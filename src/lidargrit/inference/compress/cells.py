@@ -11,9 +11,7 @@ _AT_ONCE = 1024  # nodes that are coded by what was learned before them
 _LONGEST = 40  # bits of a whole number
 
 
-def code_cells(
-    coder: Coder, bits: int, count: int, cells: Int64[np.ndarray, "n 3"] | None
-) -> Int64[np.ndarray, "n 3"]:
+def code_cells(coder: Coder, bits: int, count: int, cells: Int64[np.ndarray, "n 3"] | None) -> Int64[np.ndarray, "n 3"]:
     """Code or decode cells, some perhaps several times, in the order of :func:`order_of_cells`.
 
     Args:

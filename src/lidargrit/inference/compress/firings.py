@@ -109,7 +109,7 @@ class Firings:
     def order(
         self, row: Int64[np.ndarray, " m"], column: Int64[np.ndarray, " m"], distance_m: Float64[np.ndarray, " m"]
     ) -> Int64[np.ndarray, " m"]:
-        """Return the order in which a file lists points of some pixels: by laser, and by the azimuth from the origin."""
+        """Return the order in which a file lists points of some pixels: by laser, and by azimuth from the origin."""
         beside = self.aside[row] * LENGTH_M / np.maximum(distance_m, _NEAREST_M) * (self.units / (2 * np.pi))
         since = self.angles()[row, column] + (self.phase - self.first)[row] * PHASE - beside
         return np.lexsort((since % self.units, row))

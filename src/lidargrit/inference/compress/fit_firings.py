@@ -2,8 +2,8 @@
 
 Files of KITTI list one laser after the other, each by its azimuth. Drivers of Velodyne's HDL-64E place a point on the
 laser's ray: at an elevation, a height and a distance beside the axis that never change, and at an angle that an encoder
-counts in 4,000ths of a revolution. So points lie on a grid to a millimetre; their distance alone is free. KITTI odometry
-moves points by the car's way during the revolution; the grid shows once that is undone, so the way is found by it.
+counts in 4,000ths of a revolution. So points lie on a grid to a millimetre; their distance alone is free. Points of
+KITTI odometry were moved by the car's way during the revolution, which is found: undone, it shows the grid.
 """
 
 from copy import copy
@@ -157,7 +157,7 @@ class _Fit:
         return Fitted(firings, self._row, (firing - firings.beside()[self._row]) % len(fired))
 
     def _find_turn(self) -> None:
-        """Find how far the car turned, by the lasers that look farthest: at the right angle their points are in step."""
+        """Find how far the car turned, by lasers that look far: at the right angle their points are in step."""
         far_m = [np.median(self._flat_m[self._some(laser, 100)]) for laser in range(self._lasers)]
         chosen = [self._some(laser, 250) for laser in np.argsort(far_m)[-10:]]
         total = np.zeros(len(_TURNS))
@@ -204,7 +204,9 @@ class _Fit:
         """Change some numbers of the motion so that points come nearer to the lines of their lasers."""
         beside = np.stack([self._off_lines(effect)[0] for effect in effects], 1)
         weighted = beside * self._weight[:, None]
-        change = np.linalg.solve(weighted.T @ beside + 1e-6 * np.eye(len(which)), weighted.T @ self._off_lines(off_m)[0])
+        change = np.linalg.solve(
+            weighted.T @ beside + 1e-6 * np.eye(len(which)), weighted.T @ self._off_lines(off_m)[0]
+        )
         self._motion[which] = np.clip(self._motion[which] - change, -10, 10)
         self._see()
 
@@ -225,9 +227,7 @@ def _moved(points_m: Points, share: Float64[np.ndarray, " n"], motion: Float64[n
     return moved + share[:, None] * motion[:3]
 
 
-def _shifts(
-    row: Int64[np.ndarray, " n"], angle: Int64[np.ndarray, " n"], lasers: int
-) -> Int64[np.ndarray, "K"]:
+def _shifts(row: Int64[np.ndarray, " n"], angle: Int64[np.ndarray, " n"], lasers: int) -> Int64[np.ndarray, "K"]:
     """Return by how many units the angles of each laser are to be shifted for those of one firing to be one.
 
     An HDL-64E fires every 1.92 units, so two angles in succession are rare, and lie at the same firings in all rows.

@@ -90,8 +90,9 @@ class PointCodec:
             ScanError: too many points, or too far apart for such small steps.
         """
         points_m = cloud.points_m.astype(np.float64)
-        if len(points_m) > POINTS_AT_MOST:
-            raise ScanError(f"a scan of {len(points_m)} points", f"at most {POINTS_AT_MOST}", "take it apart")
+        if len(points_m) > POINTS_AT_MOST or not np.isfinite(points_m).all():
+            got = f"a scan of {len(points_m)} points{', some not finite' if len(points_m) <= POINTS_AT_MOST else ''}"
+            raise ScanError(got, f"at most {POINTS_AT_MOST:,}, all finite", "leave the others out")
         half_m = _half_of_cells(self._half_m, cloud.points_m)
         on_rays = _OnRays.of(points_m, self._half_m, half_m)
         rest = np.arange(len(points_m)) if on_rays is None else np.flatnonzero(~on_rays.chosen)
@@ -259,7 +260,9 @@ def _cells(points_m: Float64[np.ndarray, "n 3"], half_m: float, step_mm: int) ->
     extent = float((points_m - low_m).max()) / (2 * half_m)
     if extent >= 2**BITS_AT_MOST - 1:
         got = f"points {(points_m - low_m).max() / 1000:.3g} km apart in steps of {step_mm} mm"
-        raise ScanError(got, f"at most {2**BITS_AT_MOST:,} steps", "name larger steps by --step-mm, or leave far points out")
+        raise ScanError(
+            got, f"at most {2**BITS_AT_MOST:,} steps", "name larger steps by --step-mm, or leave far points out"
+        )
     cells = ((points_m - low_m) / (2 * half_m)).astype(np.int64)
     return low_m, cells, int(cells.max()).bit_length()
 
