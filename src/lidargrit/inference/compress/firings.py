@@ -94,7 +94,9 @@ class Firings:
         table = np.ascontiguousarray(planes).view("<i4").reshape(6, lasers).astype(np.int64)
         if len(fired) != columns:
             raise not_reproduced()
-        return cls(units, fired, *table, np.array(motion)), data[_HEAD.size + size :]
+        slope, height, aside, phase, shift, first = table
+        found = cls(units, fired, slope, height, aside, phase, shift, first, np.array(motion))
+        return found, data[_HEAD.size + size :]
 
     def beside(self) -> Int64[np.ndarray, "K"]:
         """Return by how many firings each row is shifted, so that its pixels lie below those of like azimuth."""

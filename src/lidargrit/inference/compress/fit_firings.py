@@ -149,11 +149,11 @@ class _Fit:
         if self._lasers * len(fired) > PIXELS_AT_MOST:
             return None
         begins = np.unique(self._row, return_index=True)[1]
-        counts = self._slope / SLOPE, self._height / LENGTH_M, self._aside / LENGTH_M, self._phase / PHASE
-        whole = [np.clip(np.rint(count), -(2**31), 2**31 - 1).astype(np.int64) for count in counts]
-        motion = np.rint(self._motion / MOTION).astype(np.int64)
+        slope, height = _whole(self._slope / SLOPE), _whole(self._height / LENGTH_M)
+        aside, phase = _whole(self._aside / LENGTH_M), _whole(self._phase / PHASE)
+        motion = _whole(self._motion / MOTION)
         first = np.floor(self._azimuth[begins] / _UNIT / PHASE).astype(np.int64) - _BEFORE
-        firings = Firings(_UNITS, fired, *whole, shift, first, motion)
+        firings = Firings(_UNITS, fired, slope, height, aside, phase, shift, first, motion)
         return Fitted(firings, self._row, (firing - firings.beside()[self._row]) % len(fired))
 
     def _find_turn(self) -> None:
@@ -209,6 +209,11 @@ class _Fit:
         )
         self._motion[which] = np.clip(self._motion[which] - change, -10, 10)
         self._see()
+
+
+def _whole(numbers: np.ndarray) -> np.ndarray:
+    """Return the nearest whole numbers of 32 bits."""
+    return np.clip(np.rint(numbers), -(2**31), 2**31 - 1).astype(np.int64)
 
 
 def _weights(off_m: np.ndarray) -> np.ndarray:

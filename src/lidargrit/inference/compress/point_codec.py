@@ -108,12 +108,11 @@ class PointCodec:
             None if reflectance is None else reflectance[source],
         )
         step_bits, slack = (0, 0) if on_rays is None else (int(on_rays.steps.max()).bit_length(), on_rays.slack)
-        begins = len(source) - len(rest), len(rest), step_bits, slack, scale, len(order)
-        head = _Head(*begins, half_m, *low_m.tolist(), bits)
+        counts = len(source) - len(rest), len(rest)
+        head = _Head(*counts, step_bits, slack, scale, len(order), half_m, *map(float, low_m), bits)
         firings, coder = None if on_rays is None else on_rays.firings, Encoder()
         found = self._code(coder, head, firings, known)
         restored = _in_order(found, order)
-        # The order of a file is kept by a list; without one the points come as they are decoded.
         packed = _HEAD.pack(*head) + (b"" if firings is None else firings.to_bytes()) + order
         return _hash(restored) + packed + coder.words()
 
@@ -283,7 +282,7 @@ def _code_corrections(coder: Coder, count: int, known: Int64[np.ndarray, "m 3"] 
     moved = np.zeros(count, dtype=bool)
     for first in range(0, count, 1024):
         part = slice(first, min(first + 1024, count))
-        outcome = None if known is None else known[part].any(1)
+        outcome = None if known is None else np.asarray(known[part].any(1))
         moved[part] = some.code(coder, np.zeros(part.stop - first, dtype=np.int64), outcome)
     folded = None if known is None else np.where(known < 0, -2 * known - 1, 2 * known)[moved].flatten()
     numbers = code_numbers(coder, 3 * int(moved.sum()), folded)
