@@ -29,16 +29,16 @@ def whole(count: int, first: int, last: int) -> np.ndarray:
 
 
 def revolution(motion: tuple[int, ...] = (0,) * 6) -> np.ndarray:
-    """Return points (n, 3) of twelve lasers that fire every 1.92 units, as the file of a driver lists them."""
-    lasers, rng = 12, np.random.default_rng(2)
+    """Return points (n, 3) of eight lasers that fire every 1.92 units in three quarters of a revolution, as the file of a driver lists them."""
+    lasers, rng = 8, np.random.default_rng(2)
     height, aside = whole(lasers, 20000, 12000), np.where(np.arange(lasers) % 2, -2600, 2600)
     slope, zero = whole(lasers, 30000, -300000), np.zeros(lasers, dtype=np.int64)
     shift = rng.integers(-40, 40, lasers)
-    fired = np.unique((np.arange(2083) * 1.92).astype(np.int64))
+    fired = np.unique((np.arange(1562) * 1.92).astype(np.int64))
     firings = Firings(4000, fired, slope, height, aside, whole(lasers, -1500, 1500), shift, zero, np.array(motion))
     angle = firings.angles() / 4000 * 2 * np.pi
     walls_m = 12 + 3 * np.cos(3 * angle) + np.where(angle % 1.1 < 0.2, 6, 0) + rng.normal(0, 0.01, angle.shape)
-    row, column = np.nonzero(rng.random(angle.shape) < 0.9)
+    row, column = np.nonzero(rng.random(angle.shape) < 0.7)
     distance_m = walls_m[row, column]
     listed = firings.order(row, column, distance_m)
     rays, at = firings.rays(), (row[listed], column[listed])
@@ -70,7 +70,7 @@ def test_lasers_are_found_as_they_were_made():
     assert fitted is not None
     rays, at = fitted.firings.rays(), (fitted.row, fitted.column)
     beside = np.cross(points_m - rays.origin_m[at], rays.direction[at])
-    assert np.quantile(np.linalg.norm(beside, axis=1), 0.99) < 0.002
+    assert np.quantile(np.linalg.norm(beside, axis=1), 0.99) < 0.004
     assert np.abs(fitted.firings.motion[:2] - [830000, 40000]).max() < 5000
 
 

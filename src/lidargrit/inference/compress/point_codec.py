@@ -108,8 +108,9 @@ class PointCodec:
             None if reflectance is None else reflectance[source],
         )
         step_bits, slack = (0, 0) if on_rays is None else (int(on_rays.steps.max()).bit_length(), on_rays.slack)
-        counts = len(source) - len(rest), len(rest)
-        head = _Head(*counts, step_bits, slack, scale, len(order), half_m, *map(float, low_m), bits)
+        low_x_m, low_y_m, low_z_m = map(float, low_m)
+        on, off = len(source) - len(rest), len(rest)
+        head = _Head(on, off, step_bits, slack, scale, len(order), half_m, low_x_m, low_y_m, low_z_m, bits)
         firings, coder = None if on_rays is None else on_rays.firings, Encoder()
         found = self._code(coder, head, firings, known)
         restored = _in_order(found, order)
