@@ -29,7 +29,7 @@ def whole(count: int, first: int, last: int) -> np.ndarray:
 
 
 def revolution(motion: tuple[int, ...] = (0,) * 6) -> np.ndarray:
-    """Return points (n, 3) of eight lasers that fire every 1.92 units in three quarters of a revolution, as the file of a driver lists them."""
+    """Return points (n, 3) of eight lasers that fire every 1.92 units, as the file of a driver lists them."""
     lasers, rng = 8, np.random.default_rng(2)
     height, aside = whole(lasers, 20000, 12000), np.where(np.arange(lasers) % 2, -2600, 2600)
     slope, zero = whole(lasers, 30000, -300000), np.zeros(lasers, dtype=np.int64)
