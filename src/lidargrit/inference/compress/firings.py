@@ -42,8 +42,8 @@ class Firings:
         units: number of units in which an encoder divides a revolution.
         fired: angles of all firings in units, rising.
         slope: tangent of each laser's elevation, in 2^-20.
-        height: its height above the origin, in 10 micrometres.
-        aside: its distance from the axis, across its ray, in 10 micrometres.
+        height: height of each laser above the origin, in 10 micrometres.
+        aside: distance of each ray from the axis, in 10 micrometres.
         phase: angle that its rays are beside whole units, in 1/4096 of one.
         shift: whole units that are added to its angle to have the firing's.
         first: angle at which its points begin in the file, in 1/4096 of a unit.
