@@ -9,8 +9,9 @@ every axis. Each scan is compressed by itself; what a file for many scans adds i
 
     python benchmarks/compression.py kitti_odometry:/data/kitti:00 -n 2 --steps-mm 20 --whole
 
-takes whole clouds: Draco gets all points; a model gets the image of all columns that the sensor fires, as one image for
-each column of its stride, with as many bits a point of that image, which is said to miss some points and move others.
+takes whole clouds: Draco and `compress --points` get all points; a model gets the image of all columns that the sensor
+fires, as one image for each column of its stride, with as many bits a point of that image, which is said to miss some
+points and move others.
 """
 
 import argparse
@@ -36,6 +37,7 @@ from lidargrit.evaluation.intervals import Estimate
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.inference.compress.point_codec import Cloud, PointCodec
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import SensorModel
@@ -109,6 +111,7 @@ def whole_clouds(source: str, models: dict[str, Generator], sensor: SensorModel,
     dataset, bits = open_dataset(source), dict[str, list[float]]()
     points, returns, apart_m = list[int](), list[int](), list[np.ndarray]()
     codecs_of_models = {name: ScanCodec(model, step_mm) for name, model in models.items()}
+    seconds, every = 0.0, ("Draco, all points", "compress --points, all points")
     for index in evenly_spaced(count, len(dataset)):
         scan = dataset.scan(index)
         image = project(scan, sensor.fine())
@@ -118,7 +121,10 @@ def whole_clouds(source: str, models: dict[str, Generator], sensor: SensorModel,
             for kept in [image.return_mask[:, first :: sensor.column_stride]]
         ]
         xyz_m, on_rays_m = scan.points_xyz_m.numpy(), unproject(image).points_xyz_m.numpy()
-        bits.setdefault("Draco, all points", []).append(8.0 * len(of_points(xyz_m, step_mm)))
+        bits.setdefault(every[0], []).append(8.0 * len(of_points(xyz_m, step_mm)))
+        begun = time.process_time()
+        bits.setdefault(every[1], []).append(8.0 * len(PointCodec(step_mm).compress(Cloud(xyz_m, None))))
+        seconds += time.process_time() - begun
         bits.setdefault("Draco, points of the image", []).append(8.0 * len(of_points(on_rays_m, step_mm)))
         for name, codec in codecs_of_models.items():
             bits.setdefault(name, []).append(8.0 * sum(len(codec.compress(part)) for part in parts))
@@ -126,8 +132,9 @@ def whole_clouds(source: str, models: dict[str, Generator], sensor: SensorModel,
         returns.append(int(image.return_mask.sum()))
         apart_m.append(KDTree(on_rays_m).query(xyz_m)[0])
     for name, sizes in bits.items():
-        per = Estimate.of_ratio(sizes, points if name == "Draco, all points" else returns)
+        per = Estimate.of_ratio(sizes, points if name in every else returns)
         print(f"| {source} | {len(points)} | {step_mm} mm | {name} | {per.as_text('.2f')} |", flush=True)
+    print(f"compress --points takes {seconds / len(points):.1f} s a scan")
     middle, most = np.quantile(np.concatenate(apart_m), (0.5, 0.95))
     print(f"image: {sum(returns) / sum(points):.3f} of the points; a point of the file has one of it within")
     print(f"{100 * middle:.1f} cm in the median, and within {100 * most:.1f} cm in 95 % of all cases")

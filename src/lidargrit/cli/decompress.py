@@ -1,4 +1,4 @@
-"""Restore the range images that lidargrit compress wrote, as images or as points; a damaged file is refused."""
+"""Restore what lidargrit compress wrote, range images or points; a damaged file is refused."""
 
 import argparse
 from pathlib import Path
@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("file", type=Path, metavar="FILE.lgz", help="file that lidargrit compress wrote")
     add("out", type=Path, help="folder for the scans: empty, or begun by the same command")
     add("--model", default="pretrained", help="run by which it was compressed (default: pretrained)")
-    kind = "image for range images (H, W) in metres as .npy (default), or bin, pcd, ply, npz, or a name from: "
-    add("--format", default="image", help=kind + "lidargrit list formats")
+    kind = "image for range images (H, W) in metres as .npy (default; of --points: bin), or bin, pcd, ply, npz, or a "
+    add("--format", help=kind + "name from: lidargrit list formats")
     only = "indices of the scans that are wanted, from 0; all if not given"
     add("--only", nargs="+", type=whole_number, default=[], metavar="INDEX", help=only)
 

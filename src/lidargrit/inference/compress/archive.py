@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,25 @@ _FORMAT = 3  # of the file; 1 and 2 were none of zip
 _HEADER, _NAMES, _OPTIONS = "header.json", "names.json", "options.json"
 _FIRST_BYTES = b"PK\3\4"
 _STRICTER = {"bad_points": ["refuse"], "bad_scans": ["refuse"]}  # options by which no other scans were written so far
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """Size and content of a file of compressed scans.
+
+    Args:
+        num_returns: number of returns, or of points, of all scans.
+        num_bytes: size of the whole file in bytes.
+    """
+
+    num_scans: int
+    num_returns: int
+    num_bytes: int
+
+    @property
+    def bits_per_return(self) -> float:
+        """Bits of the whole file divided by the number of returns."""
+        return 8 * self.num_bytes / max(self.num_returns, 1)
 
 
 @contextmanager

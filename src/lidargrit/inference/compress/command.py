@@ -18,34 +18,16 @@ from lidargrit.data.run_folder import locate, projection_variant
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format, write_array
 from lidargrit.generation.generator import load
 from lidargrit.inference.complete.inputs import Inputs, ScanReader, open_inputs
-from lidargrit.inference.compress.archive import Archive, add_scan, writing
+from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
 from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.drives import DrivesOfSource, Place, PlacedScan, past_of
+from lidargrit.inference.compress.points_command import decompress_points, holds_points
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
 _SHARE_ON_RAY = 4  # scans: seconds of work, for a task takes a cluster 30 ms
-
-
-@dataclass(frozen=True)
-class Compressed:
-    """Size and content of a file of compressed scans.
-
-    Args:
-        num_returns: number of returns of all scans.
-        num_bytes: size of the whole file in bytes.
-    """
-
-    num_scans: int
-    num_returns: int
-    num_bytes: int
-
-    @property
-    def bits_per_return(self) -> float:
-        """Bits of the whole file divided by the number of returns."""
-        return 8 * self.num_bytes / max(self.num_returns, 1)
 
 
 def compress_scans(
@@ -185,27 +167,32 @@ def _write_some(work: _Work, folder: Path, indices: Sequence[int]) -> int:
     return _compressor_of(work).write(folder, indices)
 
 
-def decompress_scans(path: Path, out: Path, model: str, kind: str, chosen: Sequence[int]) -> int:
+def decompress_scans(path: Path, out: Path, model: str, kind: str | None, chosen: Sequence[int]) -> int:
     """Write the scans of a compressed file as they were, and return their number.
 
     The whole file is checked before anything is written, and each scan's pixels before its own file.
 
     Args:
-        path: file that :func:`compress_scans` wrote.
+        path: file that :func:`compress_scans` or :func:`compress_points` wrote.
         out: an empty folder, or one that the same command began: files that are there are not written again.
-        kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points.
+        model: run by which it was compressed; points need none.
+        kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points; if not
+            given, range images of a model's file, and KITTI's ``.bin`` of a file of points.
         chosen: indices of the scans that are wanted; all if there is none.
     """
-    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     archive = Archive(path)
+    kind = kind or ("bin" if holds_points(archive) else IMAGE)
+    form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     wrong = [index for index in chosen if not 0 <= index < len(archive)]
     if wrong:
         wanted = f"indices from 0 to {len(archive) - 1}" if len(archive) else f"no index: {path} holds no scans"
         raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
+    indices = list(dict.fromkeys(chosen)) or range(len(archive))
+    if holds_points(archive):
+        return decompress_points(archive, out, kind, indices)
     codec = _codec_of(archive, model)
     read = _Drives(archive, codec).read if codec.past_scans else lambda index: codec.decompress(archive.read(index))
-    indices = list(dict.fromkeys(chosen)) or range(len(archive))
     names = [archive.names[index] for index in indices]
     facts = {"source": path.name, "index_crc32": archive.index_crc32}
     facts |= {"step_mm": codec.steps.step_mm, "format": kind}

@@ -1,0 +1,100 @@
+"""A source of scans → one file of compressed points, and back into a file of points for each scan."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from lidargrit.core import reporting
+from lidargrit.core.errors import ScanError, UsageError, no_usable_scan
+from lidargrit.core.version import __version__
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format
+from lidargrit.data.sources import open_source
+from lidargrit.data.sources.named import PointScans, named_scans
+from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
+from lidargrit.inference.compress.coder import not_reproduced
+from lidargrit.inference.compress.point_codec import Cloud, PointCodec
+from lidargrit.scans.types import Scan
+
+_MARK = "points"  # entry of the header by which such a file is known
+_NOT_KEPT = (("label", "labels"), ("point_time_s", "times of points"))
+
+
+def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) -> Compressed:
+    """Write all points of the scans of a source into one file, each scan by itself.
+
+    Args:
+        out: file to write, which appears when it is whole; the same command goes on with one that was interrupted.
+        step_mm: twice as much as any coordinate may change, in millimetres.
+        config: number of scans, and what to do with unusable points and scans.
+    """
+    codec, scans = PointCodec(step_mm), named_scans(open_source(source, config.bad_points), config)
+    if not isinstance(scans, PointScans):
+        raise UsageError(f"range images in {source} with --points", "scans of points", "leave --points out")
+    names = [scans.name(index) for index in range(len(scans))]
+    check_names(source, names)  # of which a file has each once
+    chosen = {"source": source, "max_scans": config.max_scans}
+    chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
+    header, told = {_MARK: True, "step_mm": step_mm, "lidargrit": __version__}, False
+    with writing(out, header, chosen) as writer:
+        missing = writer.missing([scans.identity(index) for index in range(len(scans))])
+        with reporting.progress("compressing", len(scans), len(scans) - len(missing)) as progress:
+            for index in missing:
+                data, count = b"", 0
+                try:
+                    scan = scans.scan(index)
+                    data, count = codec.compress(_cloud(scan)), len(scan)
+                except ScanError as error:
+                    if config.bad_scans != "skip":
+                        raise
+                    reporting.message(f"left out: {error}")
+                else:
+                    lost = [word for name, word in _NOT_KEPT if getattr(scan, name) is not None]
+                    if lost and not told:
+                        reporting.message(f".lgz keeps no {' and no '.join(lost)}")
+                    told = told or bool(lost)
+                add_scan(writer.folder, index, (names[index], scans.identity(index), count), data)
+                progress.advance(1)
+        counts = writer.sizes()
+        if not counts:
+            raise no_usable_scan(source)
+    return Compressed(len(counts), sum(counts), out.stat().st_size)
+
+
+def holds_points(archive: Archive) -> bool:
+    """Return whether a file of compressed scans is of points."""
+    return archive.header.get(_MARK) is True
+
+
+def decompress_points(archive: Archive, out: Path, kind: str, indices: Sequence[int]) -> int:
+    """Write the points of scans of a compressed file, and return the number of scans.
+
+    Args:
+        out: an empty folder, or one that the same command began: files that are there are not written again.
+        kind: name or ending of a format.
+        indices: indices of the scans that are wanted.
+    """
+    if kind == IMAGE:
+        got = f"--format image for {archive.path}, which holds points"
+        raise UsageError(got, "a format of points", "leave --format out, or name bin, pcd, ply or npz")
+    form, suffix = writable_format(kind)
+    step_mm = archive.header.get("step_mm")
+    if not isinstance(step_mm, int) or step_mm < 1:
+        raise not_reproduced()
+    codec, names = PointCodec(step_mm), [archive.names[index] for index in indices]
+    facts = {"source": archive.path.name, "index_crc32": archive.index_crc32, "step_mm": step_mm, "format": kind}
+    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], names)
+    with folder.writing("decompressing") as progress:
+        for number in folder.missing:
+            points_m, reflectance = codec.decompress(archive.read(indices[number]))
+            known = None if reflectance is None else torch.from_numpy(reflectance)
+            scan = Scan(torch.from_numpy(points_m), known, source=f"{archive.path}, scan {names[number]}")
+            form.write(out / folder.files[number], scan)
+            progress.advance(1)
+    return folder.num_written
+
+
+def _cloud(scan: Scan) -> Cloud:
+    reflectance = None if scan.reflectance is None else scan.reflectance.numpy()
+    return Cloud(scan.points_xyz_m.numpy(), reflectance)
