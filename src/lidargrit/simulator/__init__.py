@@ -16,7 +16,7 @@ from lidargrit.simulator.beams import REVOLUTION_S
 from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
-from lidargrit.simulator.scene.road import Road
+from lidargrit.simulator.scene.long_road import LongRoad
 from lidargrit.simulator.scene.street_plan import sample_street_plan
 from lidargrit.simulator.scene.stretches import EXTENT_M
 from lidargrit.simulator.setups import setup_of
@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
-FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
+FRAMES_AT_MOST = 100_000  # of a drive, which are 20 to 220 km
 ROAD_M = 100.0  # that our car drives in a street that ends: .97 of the returns are still there, after 140 m .17
 _HDL64E_OF_KITTI = RaydropModel()
 _DEFAULT = "hdl64e_kitti_odometry"
@@ -122,10 +122,8 @@ def observe(
     """
     check_settings(seed, theme, max(frame, frames - 1), wet)
     sensor = sensor or load_sensor(_DEFAULT)
-    root = np.random.default_rng(seed)
-    beam_rng = root.spawn(2)[1]
-    if frame:
-        beam_rng = root.spawn(frame)[-1]
+    # Children of a seed: 0 is the street's, and each frame has one.
+    beam_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(frame + 1,)))
     config = ObservationConfig(FRAME_S * frame, motion, wet, kept_columns_only, model)
     if max(frames, frame + 1) <= frames_before_end(seed, theme):
         scene, street_rng = _street(seed, theme)
@@ -144,9 +142,9 @@ def _street(seed: int, theme: Theme) -> tuple[Scene, np.random.Generator]:
 
 
 @lru_cache(maxsize=1)
-def _road(seed: int, theme: Theme) -> Road:
+def _road(seed: int, theme: Theme) -> LongRoad:
     """Return the street of a seed that goes on."""
-    return Road(seed, theme)
+    return LongRoad(seed, theme)
 
 
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:

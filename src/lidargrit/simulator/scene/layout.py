@@ -93,13 +93,17 @@ def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> li
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
     lots = [*_parks(rng, town), *(_woods(rng, plan.stretch) if plan.theme == "country" else [])]
-    count = rng.poisson({"city": 90, "suburb": 160, "country": 60}[plan.theme] * green * plan.stretch.share_around(55))
-    lots.append(np.column_stack((plan.stretch.around(rng, 55, count), rng.normal(0, 45, count))))
+    count = rng.poisson(
+        {"city": 90, "suburb": 160, "country": 60}[plan.theme] * green * plan.stretch.share_around(55.0)
+    )
+    lots.append(np.column_stack((plan.stretch.around(rng, 55.0, count), rng.normal(0, 45, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
     wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
-    count = rng.poisson({"city": 45, "suburb": 170, "country": 60}[plan.theme] * green * plan.stretch.share_around(35))
-    points = [np.column_stack((plan.stretch.around(rng, 35, count), rng.normal(0, 18, count))), *_parks(rng, town)]
+    count = rng.poisson(
+        {"city": 45, "suburb": 170, "country": 60}[plan.theme] * green * plan.stretch.share_around(35.0)
+    )
+    points = [np.column_stack((plan.stretch.around(rng, 35.0, count), rng.normal(0, 18, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
     return [*wood, make_bushes(rng, u, v, plan.level_m[1])]
 
@@ -125,16 +129,16 @@ def _parks(rng: np.random.Generator, town: Settlement) -> list[np.ndarray]:
 def _woods(rng: np.random.Generator, stretch: Stretch) -> list[np.ndarray]:
     """Sample clumps of trees, and long rows of them that bound fields."""
     lots = []
-    for _ in range(rng.poisson(2.5 * stretch.share_around(55))):
+    for _ in range(rng.poisson(2.5 * stretch.share_around(55.0))):
         count = rng.integers(12, 36)
-        middle = stretch.around(rng, 55, 1)[0], rng.choice([-1, 1]) * rng.uniform(18, 80)
+        middle = stretch.around(rng, 55.0, 1)[0], rng.choice([-1, 1]) * rng.uniform(18, 80)
         lots.append(np.column_stack((rng.normal(middle[0], 14, count), rng.normal(middle[1], 8, count))))
     for side in (-1, 1):
         row = np.arange(*stretch.span(110.0), rng.uniform(3.0, 6.0))
         lots.append(np.column_stack((row, side * rng.uniform(35, 85) + rng.normal(0, 2.0, len(row)))))
     for _ in range(2):
         column = np.arange(20.0, 110.0, rng.uniform(3.0, 6.0)) * rng.choice([-1, 1])
-        lots.append(np.column_stack((stretch.around(rng, 60, 1) + rng.normal(0, 2.0, len(column)), column)))
+        lots.append(np.column_stack((stretch.around(rng, 60.0, 1) + rng.normal(0, 2.0, len(column)), column)))
     return lots
 
 
@@ -176,14 +180,14 @@ def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
             rows.append(
                 _beside(plan, along, v, -side * np.pi / 2, furniture.LAMP, int(rng.integers(furniture.VARIANTS)))
             )
-        along = rng.uniform(*plan.stretch.span(70), rng.poisson((1.5 if wild else 3.0) * plan.stretch.share(70)))
+        along = rng.uniform(*plan.stretch.span(70.0), rng.poisson((1.5 if wild else 3.0) * plan.stretch.share(70.0)))
         facing, v = 0.0 if side < 0 else np.pi, side * (edge + _pole_offset(rng, pavement))
         rows.append(_beside(plan, along, v, facing, furniture.SIGN, rng.integers(furniture.VARIANTS, size=len(along))))
         if wild or pavement < 1.2:
             continue
         rows.append(_standing_about(rng, plan, which, side))
         if rng.random() < 0.25:
-            low, high = plan.stretch.span(40)
+            low, high = plan.stretch.span(40.0)
             first = rng.uniform(low, high - 10)
             along = np.arange(first, first + rng.uniform(6, 25), 2.0)
             variant = int(rng.integers(furniture.VARIANTS))
@@ -195,12 +199,12 @@ def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
 
 def _standing_about(rng: np.random.Generator, plan: StreetPlan, which: int, side: int) -> np.ndarray:
     """Sample bins, cabinets, benches, tubs and the like: the low ones by the houses, few by the kerb."""
-    count = rng.poisson(_ABOUT[plan.theme] * plan.stretch.share(60))
+    count = rng.poisson(_ABOUT[plan.theme] * plan.stretch.share(60.0))
     kind = rng.choice(list(_ABOUT_SHARES), count, p=list(_ABOUT_SHARES.values()))
     at_kerb = np.isin(kind, (furniture.METER, furniture.SIGNAL, furniture.GUIDE)) | (rng.random(count) < 0.2)
     wide = np.where(kind == furniture.SHELTER, 1.0, 0.45)
     v = plan.edge_m[which] + np.where(at_kerb, 0.5, np.maximum(plan.pavement_m[which] - wide, 0.6))
-    u, turn = rng.uniform(*plan.stretch.span(60), count), np.where(side < 0, -np.pi / 2, np.pi / 2) + 0 * v
+    u, turn = rng.uniform(*plan.stretch.span(60.0), count), np.where(side < 0, -np.pi / 2, np.pi / 2) + 0 * v
     turn = np.where(np.isin(kind, (furniture.SIGNAL, furniture.GUIDE)), 0.0 if side < 0 else np.pi, turn)
     return _beside(plan, u, side * v, turn, kind, rng.integers(furniture.VARIANTS, size=count))
 
@@ -249,7 +253,7 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
             u = np.full(len(v), street.u_m + flank * (street.half_m - 1.0))
             turn = rng.choice([0.0, np.pi], len(v)) + rng.normal(0, 0.025, len(v))
             placements.append(Placements.of(u, v, turn, across=True))
-    wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & plan.stretch.keeps(town.gaps_m[:, 0], 70)]
+    wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & plan.stretch.keeps(town.gaps_m[:, 0], 70.0)]
     wide = wide[rng.random(len(wide)) < {"city": 0.2, "suburb": 0.45, "country": 0.2}[plan.theme]]
     u, side = wide[:, 0] + 1.7, wide[:, 2]
     v = side * (np.where(side > 0, plan.front(1), -plan.front(-1)) + rng.uniform(0.0, 5.0, len(wide)))
@@ -295,16 +299,14 @@ def oncoming_speed_m_s(batches: Sequence[ObjectBatch]) -> float | None:
 
 def _oncoming(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Placements:
     """Sample who comes towards us in a further stretch; on a single lane nobody does."""
-    rate = _TRAFFIC[plan.theme] / 2 * plan.stretch.share(92) * (1 + speed_m_s / plan.speed_m_s)
-    low, high = plan.stretch.span(92)
+    rate = _TRAFFIC[plan.theme] / 2 * plan.stretch.share(92.0) * (1 + speed_m_s / plan.speed_m_s)
+    low, high = plan.stretch.span(92.0)
     met_at = low + np.cumsum(_MET_APART_M + rng.exponential((high - low) / rate, 40))
     met_at = met_at[(met_at < high) & (plan.lanes == 2)]
     return Placements.of(_met(plan, met_at, np.pi, speed_m_s), plan.lane_m / 2, np.pi, speed_m_s)
 
 
-def _met(
-    plan: StreetPlan, u_m: np.ndarray, turn_rad: float | np.ndarray, speed_m_s: float | np.ndarray
-) -> np.ndarray:
+def _met(plan: StreetPlan, u_m: np.ndarray, turn_rad: float | np.ndarray, speed_m_s: float | np.ndarray) -> np.ndarray:
     """Return where those who move are at time 0 that our car meets at positions along the street."""
     return u_m - speed_m_s * np.cos(turn_rad) * u_m / plan.speed_m_s
 
@@ -347,10 +349,12 @@ def traffic(
     if len(riders):
         groups.append(make_cyclists(rng, riders, following))
     following += len(riders)
-    count = rng.poisson(1.2 * plan.stretch.share(40)) if plan.theme != "country" else 0
+    count = rng.poisson(1.2 * plan.stretch.share(40.0)) if plan.theme != "country" else 0
     side = rng.choice([-1, 1], count)
     v = np.where(side > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
-    bicycles = Placements.of(rng.uniform(*plan.stretch.span(40), count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1])
+    bicycles = Placements.of(
+        rng.uniform(*plan.stretch.span(40.0), count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1]
+    )
     clear = plan.in_side_street(bicycles.u_m, bicycles.v_m, 2.0) < 0
     if clear.any():
         groups.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
@@ -359,13 +363,13 @@ def traffic(
 
 def _riders(rng: np.random.Generator, plan: StreetPlan) -> Placements:
     """Sample cyclists: before us at our speed, and towards us; in later stretches those who come towards us."""
-    count = rng.poisson(_CYCLISTS[plan.theme] * plan.stretch.share(60))
+    count = rng.poisson(_CYCLISTS[plan.theme] * plan.stretch.share(60.0))
     side = rng.choice([-1, 1], count)
     against_v_m = plan.edge_m[1] - 0.5 - 2.1 * plan.parked[1]
     slow = np.minimum(plan.speed_m_s, 5.0)
     if plan.stretch is not Stretch.FIRST:
         passes = against_v_m - plan.our_v_m > _PASSES_M
-        u = rng.uniform(*plan.stretch.span(60), count)[(side > 0) & passes]
+        u = rng.uniform(*plan.stretch.span(60.0), count)[(side > 0) & passes]
         return Placements.of(_met(plan, u, np.pi, slow + 1.0), against_v_m, np.pi, slow + 1.0)
     u = rng.uniform(8, 60, count) * rng.choice([-1, 1], count)
     v = np.where(side < 0, plan.our_v_m - 0.1, against_v_m)
@@ -375,13 +379,13 @@ def _riders(rng: np.random.Generator, plan: StreetPlan) -> Placements:
 
 
 def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:
-    count = rng.poisson(_WALKERS[plan.theme] * plan.stretch.share_around(28))
+    count = rng.poisson(_WALKERS[plan.theme] * plan.stretch.share_around(28.0))
     side = rng.choice([-1, 1], count)
     across = np.where(side > 0, *plan.edge_m[::-1]) + np.where(side > 0, *plan.pavement_m[::-1]) * rng.uniform(
         0.3, 0.9, count
     )
     speed = np.where(rng.random(count) < 0.75, rng.uniform(0.7, 1.8, count), 0.0)
-    u = plan.stretch.around(rng, 28, count)
+    u = plan.stretch.around(rng, 28.0, count)
     if plan.stretch is Stretch.FIRST:
         u = np.clip(u, -80, 80)
     keep = plan.in_side_street(u, side * across, 1.0) < 0

@@ -127,9 +127,7 @@ def _v_edges(plan: StreetPlan) -> np.ndarray:
     return np.array(edges)
 
 
-def _kinds(
-    plan: StreetPlan, rng: np.random.Generator, bays: np.ndarray, u: np.ndarray, v: np.ndarray
-) -> np.ndarray:
+def _kinds(plan: StreetPlan, rng: np.random.Generator, bays: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     green = {"city": 0.25, "suburb": 0.6, "country": 1.0}[plan.theme]
     block = (np.floor(u / 17.0) * 7 + np.floor(v / 23.0)).astype(int) % 64
     kind = np.where((rng.random(64) < green)[block], _GREEN, _YARD)

@@ -99,7 +99,7 @@ def lay_out_houses(
     plain = np.concatenate([np.full(len(b[0]), b is garages) for b in blocks])
     if taken_m is not None:
         apart = (extents[:, None, [0, 2]] > taken_m[:, [1, 3]]) | (extents[:, None, [1, 3]] < taken_m[:, [0, 2]])
-        free = apart.any(axis=2).all(axis=1)
+        free = ~np.any(~np.any(apart, axis=2), axis=1)
         placements, size, plain = placements.select(free), size[free], plain[free]
         extents = extents[free]
     houses = _sample_houses(rng, plan, placements, size, plain)
@@ -155,7 +155,9 @@ def _stand_beside(
     u_near, u_far = street.u_m + flank * front, street.u_m + flank * (front + depth)
     others = np.array([s.u_m for s in plan.side_streets if s is not street and side in s.sides])
     middle_u = (u_near + u_far) / 2
-    clear = (np.abs(middle_u[:, None] - others) > depth[:, None] / 2 + 6.0).all(axis=1) & (np.abs(middle_u) < _BESIDE_TO_M[plan.stretch])
+    clear = (np.abs(middle_u[:, None] - others) > depth[:, None] / 2 + 6.0).all(axis=1) & (
+        np.abs(middle_u) < _BESIDE_TO_M[plan.stretch]
+    )
     if np.isfinite(plan.bridge_u_m):
         clear &= (np.abs(middle_u - plan.bridge_u_m) > 18) | (start > 75)
     placements = Placements.of(middle_u, side * (start + length / 2), np.pi if flank > 0 else 0.0, across=True)

@@ -29,7 +29,7 @@ _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
 _VIEWPOINT_SPACING_M = 6.0  # at most, along our car's way
 _SKEW_REACH_M, _SKEW_WIDTH_M = 25.0, 25.0  # how far from our road, and from its mouth, a side street runs askew
 
-_FROM_END_M, _SKEW_FROM_END_M = 26.0, 60.0  # side streets, and those askew, to the end of their further stretch
+_FROM_END_M, _SKEW_FROM_END_M = 26.0, 75.0  # side streets, and those askew, to the end of their further stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,7 +337,7 @@ def sample_bridge(rng: np.random.Generator, streets: tuple[SideStreet, ...], to_
 def sample_further_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
     """Sample the side streets of a further stretch; near its ends none is askew, so that all stretches fit."""
     streets: list[SideStreet] = []
-    for _ in range(min(rng.poisson(_SIDE_STREETS[kind] * Stretch.FURTHER.share_around(42)), 8)):
+    for _ in range(min(rng.poisson(_SIDE_STREETS[kind] * Stretch.FURTHER.share_around(42.0)), 8)):
         u = rng.uniform(-1, 1) * (LENGTH_M / 2 - _FROM_END_M)
         skew = np.clip(rng.normal(0, 0.25), -0.5, 0.5) if abs(u) < LENGTH_M / 2 - _SKEW_FROM_END_M else 0.0
         sides = ((-1, 1), (1,), (-1,))[rng.choice(3, p=[0.4, 0.3, 0.3])]

@@ -1,6 +1,6 @@
 """A street that goes on: a seed → stretch after stretch of one road, of which those near our car are kept."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +22,9 @@ from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M, Stretch
 
 _KNOT_M = 2.0  # from one knot of the line to the next
 _LAST_KNOT_M = 126.0  # of the first stretch: the first knot behind its end
+_BRIDGE_FROM_END_M = 40.0
 _HEADING_RAD, _HEADING_AT_MOST_RAD = 0.45, 0.9  # of the road at the end of a stretch, so that it never meets itself
-_BEND_M, _BEND_AT_M, _RADIUS_M = (15.0, 35.0), 50.0, 35.0
+_BEND_M, _BEND_AT_M, _RADIUS_M = (15.0, 35.0), 50.0, 60.0
 _ONCOMING = (0.8, 1.2)  # of our speed, where nobody comes towards us in the first stretch
 _IN_OUR_WAY_M = 1.6  # from the middle of our car to that of another's, at most
 _INSTANCES, _INSTANCES_APART = 65_535, 512  # labels hold 16 bits; no stretch has so many objects
@@ -39,7 +40,7 @@ class _Sketch:
     rng: np.random.Generator
 
 
-class Road:
+class LongRoad:
     """The street of a seed, with further stretches beyond the end of its first one.
 
     The first stretch is that of :func:`sample_scene`, with details all along. Every further stretch has a random stream
@@ -64,6 +65,7 @@ class Road:
         self._oncoming_m_s = fast if speed_m_s is None else speed_m_s
         first = lay_out_rest(rest_rng, self._plan, first)
         self._first = replace(first, moving=tuple(self._passes_us(batch) for batch in first.moving))
+        self._starts = [self._plan.line[0], self._plan.line[self._plan.line[:, 0] <= _LAST_KNOT_M][-1]]
         self._parts: dict[int, Parts] = {}
         self._scene: tuple[int, Scene] | None = None
 
@@ -112,9 +114,10 @@ class Road:
     def _laid_out(self, number: int) -> Parts:
         if number == 0:
             return self._first
-        (sketch,) = (sketch for n, sketch in self._sketches(number) if n == number)
         taken_m = self._first.town.boxes_m - _middle_m(1) * np.array([1, 1, 0, 0]) if number == 1 else None
-        return lay_out_further(sketch.rng, self._plan_of(number), self._first, taken_m, self._oncoming_m_s)
+        return lay_out_further(
+            self._sketch(number).rng, self._plan_of(number), self._first, taken_m, self._oncoming_m_s
+        )
 
     def _seen_from(self, number: int, home: int, batch: ObjectBatch) -> ObjectBatch:
         """Return things that move in the coordinates, and since the time 0, of another stretch."""
@@ -131,19 +134,19 @@ class Road:
 
     def _plan_of(self, number: int) -> StreetPlan:
         """Return the plan of a stretch, whose line goes on through its neighbours."""
-        near = {n: sketch for n, sketch in self._sketches(number + 1) if abs(n - number) <= 1}
+        near = {n: self._sketch(n) for n in range(max(number - 1, 0), number + 2)}
         line = np.concatenate([
             near[n].line[: None if n == number + 1 else -1] + np.array([_middle_m(n) - _middle_m(number), 0, 0, 0, 0])
             for n in near
         ])  # fmt: skip
+        if number == 0:
+            return replace(self._plan, line=line)
         bends = tuple(
             replace(street, u_m=street.u_m + _middle_m(n) - _middle_m(number))
             for n, sketch in near.items()
             for street in sketch.streets
             if n != number and street.skew
         )
-        if number == 0:
-            return replace(self._plan, line=line, neighbours=bends)
         here = near[number]
         anchor = here.line[len(here.line) // 2, 1:3]
         line[:, 1:3] -= anchor
@@ -157,15 +160,17 @@ class Road:
             place=self._plan.place_of(anchor),
         )
 
-    def _sketches(self, last: int) -> Iterator[tuple[int, _Sketch]]:
-        """Sketch stretch after stretch, each from where the one before ends."""
-        knots = self._plan.line[self._plan.line[:, 0] <= _LAST_KNOT_M]
-        yield 0, _Sketch(knots, self._plan.side_streets, self._plan.bridge_u_m, self.rng)
-        for number in range(1, last + 1):
-            rng = self._stream(number)
-            knots = _line_from(rng, knots[-1])
-            streets = sample_further_streets(rng, self._plan.theme)
-            yield number, _Sketch(knots, streets, sample_bridge(rng, streets, LENGTH_M / 2 - 40), rng)
+    def _sketch(self, number: int) -> _Sketch:
+        """Sketch a stretch, whose line begins where the one before ends."""
+        if number == 0:
+            line = self._plan.line[self._plan.line[:, 0] <= _LAST_KNOT_M]
+            return _Sketch(line, self._plan.side_streets, self._plan.bridge_u_m, self.rng)
+        while len(self._starts) <= number:
+            self._starts.append(_line_from(self._stream(len(self._starts) - 1), self._starts[-1])[-1])
+        rng = self._stream(number)
+        line = _line_from(rng, self._starts[number])
+        streets = sample_further_streets(rng, self._plan.theme)
+        return _Sketch(line, streets, sample_bridge(rng, streets, LENGTH_M / 2 - _BRIDGE_FROM_END_M), rng)
 
     def _stream(self, number: int) -> np.random.Generator:
         """Return the random stream of a stretch: a child of the street's, which its first stretch does not use."""
