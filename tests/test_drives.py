@@ -15,6 +15,7 @@ from lidargrit.data.datasets import data_set_and_split, open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.export import export_scans
 from lidargrit.scans.sensors import load_sensor
+from lidargrit.simulator import simulate
 
 SENSOR = replace(load_sensor("vlp16").with_columns(360), name="a small sensor")
 
