@@ -15,7 +15,7 @@ from lidargrit.data.datasets import data_set_and_split, open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.export import export_scans
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.simulator import frames_of, scene_of, simulate
+from lidargrit.simulator import simulate
 
 SENSOR = replace(load_sensor("vlp16").with_columns(360), name="a small sensor")
 
@@ -137,28 +137,6 @@ def test_what_is_there_is_kept_and_more_is_added(drive, tmp_path):
     (tmp_path / "mine" / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match=r"holds no simulated\.json"):
         write_drives(tmp_path / "mine", 1, config)
-
-
-def test_a_drive_ends_where_its_street_ends(tmp_path, capsys):
-    """Beyond the end of the built road a scan has a tenth of the returns, and no street in it."""
-    for seed in (0, 1):
-        last, scene = frames_of(seed) - 1, scene_of(seed)
-        assert 90 < scene.speed_m_s * 0.1 * last <= 100 < scene.speed_m_s * 0.1 * (last + 1)
-        first, final = (len(simulate(seed, SENSOR, frame=frame)) for frame in (0, last))
-        assert final > 0.7 * first
-        with pytest.raises(ConfigError, match=f"the frame {last + 1} of the street {seed}; .* from 0 to {last}, in"):
-            simulate(seed, SENSOR, frame=last + 1)
-    too_many = frames_of(0) + 1
-    assert frames_of(1) > too_many
-    words = ["simulate", str(tmp_path / "out"), "--frames", str(too_many), "--theme", "mixed", "-n", str(too_many + 1)]
-    assert main([*words, "--seed", "0"]) == 2
-    assert f"the frame {too_many - 1} of the street 0" in capsys.readouterr().err
-    assert frames_of(2) < too_many
-    with pytest.raises(ConfigError, match=f"the frame {too_many - 1} of the street 2"):  # not of the first, street 1
-        write_drives(tmp_path / "out", 2 * too_many, DriveConfig(SENSOR, seed=1, frames=too_many))
-    assert not (tmp_path / "out").exists()
-    parked = next(seed for seed in range(40) if scene_of(seed).speed_m_s == 0)
-    assert frames_of(parked) == 100_000
 
 
 def test_files_of_the_user_among_the_labels_are_left_alone(tmp_path):

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--sensor", default=_SENSOR, help="name or .json file of the sensor")
     seed = "seed of the first street; each next street has the next seed"
     add("--seed", type=seed_number, default=0, help=seed)
-    add("--frames", type=int, default=1, help="scans of each street, 0.1 s apart; a street ends at 100 m")
+    add("--frames", type=int, default=1, help="scans of each street, 0.1 s apart; up to 100,000")
     add("--theme", choices=["mixed", "city", "suburb", "country"], default="mixed", help="kind of streets")
     add("--motion", action="store_true", help="keep the distortion that the car's own motion causes")
     add("--wet", type=float, default=0.0, help="wetness of the ground, from 0 (dry) to 1")

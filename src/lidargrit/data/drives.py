@@ -35,7 +35,8 @@ class DriveConfig:
 
     Args:
         seed: seed of the first street; each further street has the next seed.
-        frames: scans of each street, 0.1 s apart; with 1, every scan shows another street. A street ends after 100 m.
+        frames: scans of each street, 0.1 s apart; with 1, every scan shows another street. Streets of drives of more
+            than 100 m go on.
         motion: whether scans keep the distortion by the car's own motion; KITTI odometry has it removed.
         wet: wetness of the ground, from 0 (dry) to 1 (soaked).
         clean: whether ``observation/NNNNNN.npz`` is written, too, from which raydrop models are trained and judged: the
@@ -95,9 +96,6 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
             "at least one of each",
             "correct it",
         )
-    for last in range(config.frames - 1, num_scans + config.frames - 1, config.frames):  # of each street
-        street, frame = config.street_of(min(last, num_scans - 1))
-        check_settings(street, config.theme, frame)
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more
@@ -132,7 +130,8 @@ def _write_scans(out: Path, config: DriveConfig, scans: Sequence[int]) -> int:
 def _write_scan(out: Path, config: DriveConfig, scan: int) -> None:
     """Write one scan's files; its labels come last and say that the others are there."""
     seed, frame = config.street_of(scan)
-    seen = observe(seed, config.sensor, theme=config.theme, frame=frame, motion=config.motion, wet=config.wet)
+    settings = {"theme": config.theme, "motion": config.motion, "wet": config.wet}
+    seen = observe(seed, config.sensor, frame=frame, frames=config.frames, **settings)
     if not seen.return_mask.any():
         raise DataError(
             f"no return in the simulated street {seed} by the sensor {config.sensor.name!r}",

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import get_args
 
@@ -15,7 +16,9 @@ from lidargrit.simulator.beams import REVOLUTION_S
 from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
+from lidargrit.simulator.scene.long_road import LongRoad
 from lidargrit.simulator.scene.street_plan import sample_street_plan
+from lidargrit.simulator.scene.stretches import EXTENT_M
 from lidargrit.simulator.setups import setup_of
 
 __all__ = [
@@ -23,7 +26,7 @@ __all__ = [
     "RaydropModel",
     "Scene",
     "Theme",
-    "frames_of",
+    "frames_before_end",
     "observe",
     "poses_of",
     "scene_of",
@@ -31,8 +34,8 @@ __all__ = [
 ]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
-FRAMES_AT_MOST = 100_000  # each has a random stream of its own, and they are set up one after the other
-ROAD_M = 100.0  # that our car drives at most: 0.97 of the returns are still there, after 120 m 0.72, after 140 m 0.17
+FRAMES_AT_MOST = 100_000  # of a drive, which are 20 to 220 km
+ROAD_M = 100.0  # that our car drives in a street that ends: .97 of the returns are still there, after 140 m .17
 _HDL64E_OF_KITTI = RaydropModel()
 _DEFAULT = "hdl64e_kitti_odometry"
 
@@ -43,6 +46,7 @@ def simulate(
     *,
     theme: Theme = "mixed",
     frame: int = 0,
+    frames: int = 1,
     motion: bool = False,
     wet: float = 0.0,
     kept_columns_only: bool = False,
@@ -58,8 +62,11 @@ def simulate(
         seed: seed of the street and of the noise, 0 or more; the same seed gives the same scan, bit for bit.
         sensor: sensor to simulate, with every column that it fires; the HDL-64E of KITTI odometry if not given.
         theme: kind of street.
-        frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street, which ends
-            after 100 m; see :func:`frames_of`.
+        frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street.
+        frames: how many frames of the drive are wanted; 1 means as many as it takes to get to ``frame``. A street of
+            which 100 m are driven ends 125 m from its start. A longer drive goes on through further stretches of the
+            road, and its first frames see them, too, so that nothing appears from one frame to the next: give all
+            frames of one drive the same number.
         motion: whether points stay as a moving car measures them, distorted by its motion; otherwise all are as seen
             from where the revolution began, which is how KITTI odometry stores them.
         wet: wetness of asphalt and concrete, from 0 (dry) to 1 (soaked).
@@ -72,8 +79,7 @@ def simulate(
         ahead; with ring, reflectance, and label as SemanticKITTI's files hold it (the instance in the upper 16 bits).
 
     Raises:
-        ConfigError: a negative seed or frame, a frame after the end of the street, an unknown theme, or a wetness
-            outside [0, 1].
+        ConfigError: a negative seed or frame, 100,000 frames or more, an unknown theme, or a wetness outside [0, 1].
         ScanError: not one beam came back.
 
     Example:
@@ -86,6 +92,7 @@ def simulate(
         sensor,
         theme=theme,
         frame=frame,
+        frames=frames,
         motion=motion,
         wet=wet,
         kept_columns_only=kept_columns_only,
@@ -100,6 +107,7 @@ def observe(
     *,
     theme: Theme = "mixed",
     frame: int = 0,
+    frames: int = 1,
     motion: bool = False,
     wet: float = 0.0,
     kept_columns_only: bool = False,
@@ -112,15 +120,18 @@ def observe(
     Returns:
         arrays of one value for each pixel of ``sensor.fine()``, or of ``sensor`` if ``kept_columns_only``.
     """
-    check_settings(seed, theme, frame, wet)
+    check_settings(seed, theme, max(frame, frames - 1), wet)
     sensor = sensor or load_sensor(_DEFAULT)
-    root = np.random.default_rng(seed)
-    beam_rng = root.spawn(2)[1]
-    if frame:
-        beam_rng = root.spawn(frame)[-1]
-    scene, street_rng = _street(seed, theme)
+    # Children of a seed: 0 is the street's, and each frame has one.
+    beam_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(frame + 1,)))
     config = ObservationConfig(FRAME_S * frame, motion, wet, kept_columns_only, model)
-    return observe_scene(scene, sensor, copy.deepcopy(street_rng), beam_rng, config)
+    if max(frames, frame + 1) <= frames_before_end(seed, theme):
+        scene, street_rng = _street(seed, theme)
+    else:
+        road = _road(seed, theme)
+        scene, street_rng = road.scene_at(config.time_s), road.rng
+    seen = observe_scene(scene, sensor, copy.deepcopy(street_rng), beam_rng, config)
+    return replace(seen, sensor_pose=scene.in_drive(seen.sensor_pose))
 
 
 @lru_cache(maxsize=1)  # all frames of a drive have one street
@@ -130,8 +141,17 @@ def _street(seed: int, theme: Theme) -> tuple[Scene, np.random.Generator]:
     return sample_scene(street_rng, theme), street_rng
 
 
+@lru_cache(maxsize=1)
+def _road(seed: int, theme: Theme) -> LongRoad:
+    """Return the street of a seed that goes on."""
+    return LongRoad(seed, theme)
+
+
 def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
-    """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car."""
+    """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car.
+
+    It is the street that ends; further stretches of a longer drive are not part of it.
+    """
     check_settings(seed, theme)
     return _street(seed, theme)[0]
 
@@ -146,11 +166,14 @@ def poses_of(
     check_settings(seed, theme)
     scene, street_rng = _street(seed, theme)
     height_m = setup_of(sensor or load_sensor(_DEFAULT), copy.deepcopy(street_rng)).height_m
-    return [scene.sensor_pose(time_s, height_m) for time_s in times_s]
+    if scene.speed_m_s * max(times_s, default=0.0) < EXTENT_M:
+        return [scene.sensor_pose(time_s, height_m) for time_s in times_s]
+    return _road(seed, theme).poses_at(times_s, height_m)
 
 
-def frames_of(seed: int, theme: Theme = "mixed") -> int:
-    """Return how many frames the drive of a seed has: with more, our car would drive out of its street."""
+@lru_cache(maxsize=1024)
+def frames_before_end(seed: int, theme: Theme = "mixed") -> int:
+    """Return how many frames a drive may have whose street ends; a drive of more frames has a road that goes on."""
     check_settings(seed, theme)
     speed_m_s = sample_street_plan(np.random.default_rng(seed).spawn(2)[0], theme).speed_m_s
     return min(FRAMES_AT_MOST, 1 + int(ROAD_M / (speed_m_s * FRAME_S))) if speed_m_s else FRAMES_AT_MOST
@@ -166,9 +189,3 @@ def check_settings(seed: int, theme: Theme, frame: int = 0, wet: float = 0.0) ->
         raise ConfigError(f"the seed {seed}", "a seed of 0 or more", "choose another seed")
     if theme not in get_args(Theme):
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of them")
-    if frame and frame >= (frames := frames_of(seed, theme)):
-        raise ConfigError(
-            f"the frame {frame} of the street {seed}",
-            f"a frame from 0 to {frames - 1}, in which our car drives the first {ROAD_M:g} m of its street",
-            "choose fewer frames, or another seed",
-        )

@@ -65,7 +65,7 @@ class Observation:
         instance: number of the object that the ray meets; 0 for what is no single object.
         cos_incidence: cosine between ray and surface normal; 0 where the ray meets nothing.
         directions: unit vectors of the rays in the sensor's frame when each was fired.
-        sensor_pose: transform from the sensor's frame to the scene's at the beginning of the revolution.
+        sensor_pose: transform from the sensor's frame to the world of the drive at the beginning of the revolution.
         fired_s: time of each ray since then, in seconds; None where the sensor stands still meanwhile.
     """
 

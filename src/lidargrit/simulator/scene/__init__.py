@@ -8,12 +8,8 @@ from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.simulator.mesh import Mesh, Objects
-from lidargrit.simulator.scene.buildings import add_houses
-from lidargrit.simulator.scene.layout import add_gardens, greenery, things, traffic
 from lidargrit.simulator.scene.objects import ObjectBatch
-from lidargrit.simulator.scene.roads import add_bridge, add_ground, add_markings
-from lidargrit.simulator.scene.settlement import lay_out_houses
-from lidargrit.simulator.scene.shapes import MeshBuilder
+from lidargrit.simulator.scene.parts import lay_out_first
 from lidargrit.simulator.scene.street_plan import StreetPlan, Theme, sample_street_plan
 
 __all__ = ["Scene", "Theme", "sample_scene"]
@@ -28,7 +24,8 @@ _ATTITUDE_RAD, _ATTITUDE_SPREAD_RAD = (0.0, -0.012, 0.0), (0.015, 0.016, 0.024)
 class Scene:
     """Standing and moving objects around our car, which is not part of the scene.
 
-    The world has z up, its origin on the road below the sensor at time 0, and x along the heading there.
+    The world has z up, its origin on the road below the sensor at time 0, and x along the heading there. That of a
+    further stretch of a road is moved by ``plan.offset_m``, so that coordinates stay small.
 
     Args:
         theme: kind of street: city, suburb or country.
@@ -37,6 +34,7 @@ class Scene:
         still: kept objects that never move.
         moving: kept objects that do.
         attitude_rad: yaw, pitch and roll of our car relative to the road.
+        begins_s: time of the drive at which our car is where u is 0.
     """
 
     theme: str
@@ -45,6 +43,7 @@ class Scene:
     still: Objects
     moving: tuple[ObjectBatch, ...]
     attitude_rad: Float64[np.ndarray, "3"]
+    begins_s: float = 0.0
 
     @property
     def speed_m_s(self) -> float:
@@ -53,7 +52,7 @@ class Scene:
 
     def objects(self, time_s: float = 0.0) -> Objects:
         """Return the kept objects at a time, in seconds."""
-        return Objects.join([self.still, *(batch.at(self.plan, time_s) for batch in self.moving)])
+        return Objects.join([self.still, *(batch.at(self.plan, time_s - self.begins_s) for batch in self.moving)])
 
     def mesh(self, time_s: float = 0.0) -> Mesh:
         """Return all triangles at a time, in seconds, those of kept objects too."""
@@ -65,7 +64,7 @@ class Scene:
         Args:
             height_m: height of the sensor above the road.
         """
-        here = self.plan.poses(np.array([self.speed_m_s * time_s]), np.array([self.plan.our_v_m]))
+        here = self.plan.poses(np.array([self.speed_m_s * (time_s - self.begins_s)]), np.array([self.plan.our_v_m]))
         yaw, pitch, roll = self.attitude_rad
         ahead, slope = float(here.yaw_rad[0]) + yaw, here.slope[0]
         forward = np.array([np.cos(ahead), np.sin(ahead), 0.0])
@@ -81,6 +80,12 @@ class Scene:
         pose[:3, 3] = here.xyz_m[0] + height_m * up
         return pose
 
+    def in_drive(self, pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+        """Return a pose of this scene in the world in which its drive begins."""
+        moved = pose.copy()
+        moved[:3, 3] += self.plan.offset_m
+        return moved
+
 
 def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
     """Sample a street scene; the same state of the generator gives the same scene, bit for bit.
@@ -91,18 +96,10 @@ def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
     if theme not in get_args(Theme):
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of these")
     plan = sample_street_plan(rng, theme)
-    builder = MeshBuilder()
-    add_ground(builder, rng, plan)
-    add_markings(builder, rng, plan)
-    add_bridge(builder, rng, plan)
-    town = lay_out_houses(rng, plan)
-    add_houses(builder, rng, plan, town.houses)
-    batches = [*add_gardens(builder, rng, plan, town), *greenery(rng, plan, town), things(rng, plan)]
-    still, moving = [batch.at(plan) for batch in batches], []
-    for batch in traffic(rng, plan, town):
-        stands, goes = batch.split()
-        still.append(stands.at(plan))
-        if len(goes.placements):
-            moving.append(goes)
-    attitude_rad = rng.normal(_ATTITUDE_RAD, _ATTITUDE_SPREAD_RAD)
-    return Scene(plan.theme, plan, builder.build(), Objects.join(still), tuple(moving), attitude_rad)
+    parts = lay_out_first(rng, plan)
+    return Scene(plan.theme, plan, parts.standing, parts.still, parts.moving, sample_attitude(rng))
+
+
+def sample_attitude(rng: np.random.Generator) -> Float64[np.ndarray, "3"]:
+    """Sample yaw, pitch and roll of a car relative to the road."""
+    return rng.normal(_ATTITUDE_RAD, _ATTITUDE_SPREAD_RAD)

@@ -73,7 +73,7 @@ def _upright(
 
 def add_guard_rails(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, side: int) -> None:
     """Add a rail on posts along one side of our road."""
-    along = np.arange(-100.0, 100.0, 4.0)
+    along = np.arange(*plan.stretch.span(100.0), 4.0)
     along = along[plan.in_side_street(along + 2.0, along * 0 + plan.edge(side), 4.0) < 0]
     v = plan.edge(side) + side * rng.uniform(0.5, 1.0)
     steel = rng.uniform(0.25, 0.45)

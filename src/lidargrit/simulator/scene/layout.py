@@ -1,5 +1,7 @@
 """Positions of everything but houses: a plan and its houses → gardens, trees, street furniture, traffic, people."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lidargrit.simulator.scene import barriers, furniture
@@ -10,9 +12,13 @@ from lidargrit.simulator.scene.plants import make_bushes, make_hedges, make_tree
 from lidargrit.simulator.scene.settlement import Settlement, free_spans
 from lidargrit.simulator.scene.shapes import MeshBuilder, rows_of
 from lidargrit.simulator.scene.street_plan import StreetPlan
+from lidargrit.simulator.scene.stretches import Stretch
 from lidargrit.simulator.scene.vehicles import make_vehicles, sample_vehicle_kinds
 
 _OUR_LENGTH_M = 9.0  # from the middle of our car to that of the next in our lane, at least
+_MET_APART_M = 8.0  # from where we meet one car to where we meet the next, at least
+_PASSES_M = 1.6  # from the middle of our car to a cyclist's, at least
+_SLOWER = 0.4  # than our car are walkers whom it meets later, at least, so that they come into sight far away
 _PARKED_SHARE = {"city": (0.25, 0.85), "suburb": (0.1, 0.65), "country": (0.0, 0.1)}
 _TRAFFIC = {"city": 3.0, "suburb": 1.2, "country": 1.5}
 _WALKERS = {"city": 5.0, "suburb": 1.0, "country": 0.15}
@@ -36,18 +42,21 @@ def add_gardens(
     for which, side in enumerate((-1, 1)):
         edge = plan.edge_m[which] + plan.pavement_m[which] + 0.15
         for low, high in free_spans(plan, side) if plan.setback_m[which] > 1.3 and plan.theme != "country" else []:
-            along = max(low, -_BOUNDARY_TO_M)
-            while along < min(high, _BOUNDARY_TO_M):
+            first, last = plan.stretch.span(_BOUNDARY_TO_M)
+            along = max(low, first)
+            while along < min(high, last):
                 length = min(rng.uniform(4, 15), high - along)
                 if rng.random() < lined and length > 1:
                     lines[str(rng.choice(list(lines), p=taste))].append((along, along + length, side * edge, side))
                 along += length + rng.uniform(0.8, 3.6)
-    for u_from, u_to, side in town.gaps_m[np.abs(town.gaps_m[:, :2]).min(axis=1) < _BOUNDARY_TO_M]:
+    ends = town.gaps_m[:, :2]
+    nearer = np.take_along_axis(ends, np.abs(ends).argmin(axis=1)[:, None], axis=1)[:, 0]
+    for u_from, u_to, side in town.gaps_m[plan.stretch.keeps(nearer, _BOUNDARY_TO_M)]:
         if rng.random() < 0.45 and plan.theme != "country":
             shut = rng.uniform(0.4, 1.0) * (u_to - u_from)
             kind = str(rng.choice(list(lines), p=taste))
             lines[kind].append((u_from, u_from + min(shut, 18.0), plan.front(int(side)) + side * 0.4, side))
-    if plan.theme == "country" and rng.random() < 0.4:
+    if plan.theme == "country" and plan.stretch is not Stretch.REST and rng.random() < 0.4:
         barriers.add_guard_rails(builder, rng, plan, int(rng.choice([-1, 1])))
     return _add_lines(builder, rng, plan, lines)
 
@@ -83,14 +92,18 @@ def _add_lines(
 def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> list[ObjectBatch]:
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
-    lots = [*_parks(rng, town), *(_woods(rng) if plan.theme == "country" else [])]
-    count = rng.poisson({"city": 90, "suburb": 160, "country": 60}[plan.theme] * green)
-    lots.append(np.column_stack((rng.normal(0, 55, count), rng.normal(0, 45, count))))
+    lots = [*_parks(rng, town), *(_woods(rng, plan.stretch) if plan.theme == "country" else [])]
+    count = rng.poisson(
+        {"city": 90, "suburb": 160, "country": 60}[plan.theme] * green * plan.stretch.share_around(55.0)
+    )
+    lots.append(np.column_stack((plan.stretch.around(rng, 55.0, count), rng.normal(0, 45, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
     wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
-    count = rng.poisson({"city": 45, "suburb": 170, "country": 60}[plan.theme] * green)
-    points = [np.column_stack((rng.normal(0, 35, count), rng.normal(0, 18, count))), *_parks(rng, town)]
+    count = rng.poisson(
+        {"city": 45, "suburb": 170, "country": 60}[plan.theme] * green * plan.stretch.share_around(35.0)
+    )
+    points = [np.column_stack((plan.stretch.around(rng, 35.0, count), rng.normal(0, 18, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
     return [*wood, make_bushes(rng, u, v, plan.level_m[1])]
 
@@ -98,7 +111,8 @@ def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> li
 def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:
     """Return the points (n, 2) that lie off roads and houses, and within the sensor's reach."""
     u, v = points.T
-    keep = _off_road(plan, u, v, spare_m) & ~town.covers(u, v, 0.5 * spare_m) & (np.hypot(u, v) < 115)
+    keep = _off_road(plan, u, v, spare_m) & ~town.covers(u, v, 0.5 * spare_m)
+    keep &= (np.hypot(u, v) if plan.stretch is Stretch.FIRST else np.abs(v)) < 115
     return points[keep]
 
 
@@ -112,19 +126,19 @@ def _parks(rng: np.random.Generator, town: Settlement) -> list[np.ndarray]:
     return lots
 
 
-def _woods(rng: np.random.Generator) -> list[np.ndarray]:
+def _woods(rng: np.random.Generator, stretch: Stretch) -> list[np.ndarray]:
     """Sample clumps of trees, and long rows of them that bound fields."""
     lots = []
-    for _ in range(rng.poisson(2.5)):
+    for _ in range(rng.poisson(2.5 * stretch.share_around(55.0))):
         count = rng.integers(12, 36)
-        middle = rng.normal(0, 55), rng.choice([-1, 1]) * rng.uniform(18, 80)
+        middle = stretch.around(rng, 55.0, 1)[0], rng.choice([-1, 1]) * rng.uniform(18, 80)
         lots.append(np.column_stack((rng.normal(middle[0], 14, count), rng.normal(middle[1], 8, count))))
     for side in (-1, 1):
-        row = np.arange(-110.0, 110.0, rng.uniform(3.0, 6.0))
+        row = np.arange(*stretch.span(110.0), rng.uniform(3.0, 6.0))
         lots.append(np.column_stack((row, side * rng.uniform(35, 85) + rng.normal(0, 2.0, len(row)))))
     for _ in range(2):
         column = np.arange(20.0, 110.0, rng.uniform(3.0, 6.0)) * rng.choice([-1, 1])
-        lots.append(np.column_stack((rng.normal(0, 60) + rng.normal(0, 2.0, len(column)), column)))
+        lots.append(np.column_stack((stretch.around(rng, 60.0, 1) + rng.normal(0, 2.0, len(column)), column)))
     return lots
 
 
@@ -135,7 +149,7 @@ def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
         wide = plan.theme == "country" or plan.pavement_m[which] > 1.8
         if not wide or rng.random() > {"city": 0.45, "suburb": 0.35, "country": 0.4}[plan.theme]:
             continue
-        row = np.arange(-90.0, 90.0, rng.uniform(7, 16)) + rng.uniform(-3, 3)
+        row = np.arange(*plan.stretch.span(90.0), rng.uniform(7, 16)) + rng.uniform(-3, 3)
         away = plan.edge_m[which] + (0.9 if plan.theme != "country" else rng.uniform(2.0, 5.0))
         row = row[(plan.in_side_street(row, row * 0 + side * away, 2.5) < 0) & (rng.random(len(row)) < 0.85)]
         rows.append(np.column_stack((row, np.full(len(row), side * away))))
@@ -161,19 +175,20 @@ def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
     for which, side in enumerate((-1, 1)):
         edge, pavement = plan.edge_m[which], plan.pavement_m[which]
         if rng.random() < (0.15 if wild else 0.75):
-            along = np.arange(-95.0, 95.0, rng.uniform(18, 34)) + rng.uniform(0, 15)
+            along = np.arange(*plan.stretch.span(95.0), rng.uniform(18, 34)) + rng.uniform(0, 15)
             v = side * (edge + _pole_offset(rng, pavement))
             rows.append(
                 _beside(plan, along, v, -side * np.pi / 2, furniture.LAMP, int(rng.integers(furniture.VARIANTS)))
             )
-        along = rng.uniform(-70, 70, rng.poisson(1.5 if wild else 3.0))
+        along = rng.uniform(*plan.stretch.span(70.0), rng.poisson((1.5 if wild else 3.0) * plan.stretch.share(70.0)))
         facing, v = 0.0 if side < 0 else np.pi, side * (edge + _pole_offset(rng, pavement))
         rows.append(_beside(plan, along, v, facing, furniture.SIGN, rng.integers(furniture.VARIANTS, size=len(along))))
         if wild or pavement < 1.2:
             continue
         rows.append(_standing_about(rng, plan, which, side))
         if rng.random() < 0.25:
-            first = rng.uniform(-40, 30)
+            low, high = plan.stretch.span(40.0)
+            first = rng.uniform(low, high - 10)
             along = np.arange(first, first + rng.uniform(6, 25), 2.0)
             variant = int(rng.integers(furniture.VARIANTS))
             rows.append(_beside(plan, along, side * (edge + 0.35), 0.0, furniture.BOLLARD, variant))
@@ -184,19 +199,19 @@ def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
 
 def _standing_about(rng: np.random.Generator, plan: StreetPlan, which: int, side: int) -> np.ndarray:
     """Sample bins, cabinets, benches, tubs and the like: the low ones by the houses, few by the kerb."""
-    count = rng.poisson(_ABOUT[plan.theme])
+    count = rng.poisson(_ABOUT[plan.theme] * plan.stretch.share(60.0))
     kind = rng.choice(list(_ABOUT_SHARES), count, p=list(_ABOUT_SHARES.values()))
     at_kerb = np.isin(kind, (furniture.METER, furniture.SIGNAL, furniture.GUIDE)) | (rng.random(count) < 0.2)
     wide = np.where(kind == furniture.SHELTER, 1.0, 0.45)
     v = plan.edge_m[which] + np.where(at_kerb, 0.5, np.maximum(plan.pavement_m[which] - wide, 0.6))
-    u, turn = rng.uniform(-60, 60, count), np.where(side < 0, -np.pi / 2, np.pi / 2) + 0 * v
+    u, turn = rng.uniform(*plan.stretch.span(60.0), count), np.where(side < 0, -np.pi / 2, np.pi / 2) + 0 * v
     turn = np.where(np.isin(kind, (furniture.SIGNAL, furniture.GUIDE)), 0.0 if side < 0 else np.pi, turn)
     return _beside(plan, u, side * v, turn, kind, rng.integers(furniture.VARIANTS, size=count))
 
 
 def _corner_signs(rng: np.random.Generator, plan: StreetPlan) -> np.ndarray:
     rows = [(s.u_m + way * (s.half_m + s.pavement_m * 0.6), plan.edge(side) + side * 0.7, 0.0, furniture.SIGN, 0)
-            for s in plan.side_streets for side in s.sides for way in (-1, 1)]  # fmt: skip
+            for s in plan.own_streets for side in s.sides for way in (-1, 1)]  # fmt: skip
     signs = np.array(rows, float).reshape(-1, 5)
     signs = signs[rng.random(len(signs)) < 0.6]
     signs[:, 2] = rng.integers(0, 4, len(signs)) * np.pi / 2
@@ -213,7 +228,8 @@ def _beside(plan: StreetPlan, *columns: float | np.ndarray) -> np.ndarray:
     """Return rows of u, v and more without those in the mouths of side streets and below the bridge."""
     rows = rows_of(*columns)
     near_bridge = np.abs(rows[:, 0] - plan.bridge_u_m) < 14.0
-    return rows[~near_bridge & (plan.in_side_street(rows[:, 0], rows[:, 1], 1.0) < 0)]
+    beyond = rows[:, 0] > plan.stretch.half_m
+    return rows[~(near_bridge | beyond) & (plan.in_side_street(rows[:, 0], rows[:, 1], 1.0) < 0)]
 
 
 def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Placements:
@@ -221,13 +237,15 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
     placements = []
     for which, side in enumerate((-1, 1)):
         if plan.parked[which]:
-            u = -92.0 + np.cumsum(rng.uniform(5.3, 7.2, 40))
-            u = u[(u < 92) & (rng.random(40) < rng.uniform(*_PARKED_SHARE[plan.theme]))]
+            low, high = plan.stretch.span(92.0)
+            at_most = 40 if plan.stretch is not Stretch.FURTHER else int((high - low) / 5.3)
+            u = low + np.cumsum(rng.uniform(5.3, 7.2, at_most))
+            u = u[(u < high) & (rng.random(at_most) < rng.uniform(*_PARKED_SHARE[plan.theme]))]
             v = side * (plan.edge_m[which] - rng.uniform(0.98, 1.08, len(u)))
             clear = plan.in_side_street(u, v, 4.0) < 0
             turn = np.where(rng.random(len(u)) < 0.85, 0.0 if side < 0 else np.pi, np.pi if side < 0 else 0.0)
             placements.append(Placements.of(u, v, turn + rng.normal(0, 0.025, len(u))).select(clear))
-    for street in plan.side_streets:
+    for street in plan.own_streets:
         for side in street.sides if street.half_m > 2.7 and plan.theme != "country" else ():
             flank = rng.choice([-1, 1])
             v = abs(plan.edge(side)) + 8.0 + np.cumsum(rng.uniform(5.4, 7.5, 11))
@@ -235,7 +253,7 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
             u = np.full(len(v), street.u_m + flank * (street.half_m - 1.0))
             turn = rng.choice([0.0, np.pi], len(v)) + rng.normal(0, 0.025, len(v))
             placements.append(Placements.of(u, v, turn, across=True))
-    wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & (np.abs(town.gaps_m[:, 0]) < 70)]
+    wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & plan.stretch.keeps(town.gaps_m[:, 0], 70.0)]
     wide = wide[rng.random(len(wide)) < {"city": 0.2, "suburb": 0.45, "country": 0.2}[plan.theme]]
     u, side = wide[:, 0] + 1.7, wide[:, 2]
     v = side * (np.where(side > 0, plan.front(1), -plan.front(-1)) + rng.uniform(0.0, 5.0, len(wide)))
@@ -270,49 +288,109 @@ def driving(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Pla
     return every.select(np.abs(every.u_m) < 105)
 
 
-def traffic(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> list[ObjectBatch]:
-    """Sample all vehicles, people and bicycles, each with an instance of its own."""
-    resting, going = parked(rng, plan, town), driving(rng, plan, plan.speed_m_s)
+def oncoming_speed_m_s(batches: Sequence[ObjectBatch]) -> float | None:
+    """Return how fast those drive who come towards us; None where nobody does."""
+    for places in (batch.placements for batch in batches if batch.leans):
+        towards = ~places.across & (places.turn_rad == np.pi) & (places.speed_m_s > 0)
+        if towards.any():
+            return float(places.speed_m_s[towards][0])
+    return None
+
+
+def _oncoming(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Placements:
+    """Sample who comes towards us in a further stretch; on a single lane nobody does."""
+    rate = _TRAFFIC[plan.theme] / 2 * plan.stretch.share(92.0) * (1 + speed_m_s / plan.speed_m_s)
+    low, high = plan.stretch.span(92.0)
+    met_at = low + np.cumsum(_MET_APART_M + rng.exponential((high - low) / rate, 40))
+    met_at = met_at[(met_at < high) & (plan.lanes == 2)]
+    return Placements.of(_met(plan, met_at, np.pi, speed_m_s), plan.lane_m / 2, np.pi, speed_m_s)
+
+
+def _met(plan: StreetPlan, u_m: np.ndarray, turn_rad: float | np.ndarray, speed_m_s: float | np.ndarray) -> np.ndarray:
+    """Return where those who move are at time 0 that our car meets at positions along the street."""
+    return u_m - speed_m_s * np.cos(turn_rad) * u_m / plan.speed_m_s
+
+
+def traffic(
+    rng: np.random.Generator,
+    plan: StreetPlan,
+    town: Settlement,
+    oncoming_m_s: float = 0.0,
+    first_instance: int = 1,
+) -> list[ObjectBatch]:
+    """Sample all vehicles, people and bicycles, each with an instance of its own.
+
+    Those of later stretches move so that our car meets them there.
+
+    Args:
+        oncoming_m_s: speed of those who drive towards us in further stretches.
+        first_instance: number of the first instance.
+    """
+    resting = parked(rng, plan, town)
+    match plan.stretch:
+        case Stretch.FIRST:
+            going = driving(rng, plan, plan.speed_m_s)
+        case Stretch.REST:
+            going = Placements.of(np.zeros(0), 0.0)
+        case Stretch.FURTHER:
+            going = _oncoming(rng, plan, oncoming_m_s)
     placements = Placements.join([resting, going])
     kinds = np.concatenate(
         (sample_vehicle_kinds(rng, len(resting), large=0.0), sample_vehicle_kinds(rng, len(going), large=0.06))
     )
     kinds[placements.across] = HATCHBACK  # short drives and narrow streets
-    groups = [make_vehicles(rng, kinds, placements, 1)]
-    following = len(placements) + 1
+    groups = [make_vehicles(rng, kinds, placements, first_instance)]
+    following = first_instance + len(placements)
     walkers = _walkers(rng, plan)
     if len(walkers):
         groups.append(make_walkers(rng, walkers, following))
     following += len(walkers)
-    count = rng.poisson(_CYCLISTS[plan.theme])
-    side = rng.choice([-1, 1], count)
-    u = rng.uniform(8, 60, count) * rng.choice([-1, 1], count)
-    v = np.where(side < 0, plan.our_v_m - 0.1, plan.edge_m[1] - 0.5 - 2.1 * plan.parked[1])
-    slow = np.minimum(plan.speed_m_s, 5.0)
-    away = (side > 0) | (u > 12)
-    riders = Placements.of(u, v, np.where(side < 0, 0.0, np.pi), np.where(side < 0, plan.speed_m_s, slow + 1.0)).select(
-        away
-    )
+    riders = _riders(rng, plan)
     if len(riders):
         groups.append(make_cyclists(rng, riders, following))
     following += len(riders)
-    count = rng.poisson(1.2) if plan.theme != "country" else 0
+    count = rng.poisson(1.2 * plan.stretch.share(40.0)) if plan.theme != "country" else 0
     side = rng.choice([-1, 1], count)
     v = np.where(side > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
-    bicycles = Placements.of(rng.uniform(-40, 40, count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1])
+    bicycles = Placements.of(
+        rng.uniform(*plan.stretch.span(40.0), count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1]
+    )
     clear = plan.in_side_street(bicycles.u_m, bicycles.v_m, 2.0) < 0
     if clear.any():
         groups.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
     return groups
 
 
+def _riders(rng: np.random.Generator, plan: StreetPlan) -> Placements:
+    """Sample cyclists: before us at our speed, and towards us; in later stretches those who come towards us."""
+    count = rng.poisson(_CYCLISTS[plan.theme] * plan.stretch.share(60.0))
+    side = rng.choice([-1, 1], count)
+    against_v_m = plan.edge_m[1] - 0.5 - 2.1 * plan.parked[1]
+    slow = np.minimum(plan.speed_m_s, 5.0)
+    if plan.stretch is not Stretch.FIRST:
+        passes = against_v_m - plan.our_v_m > _PASSES_M
+        u = rng.uniform(*plan.stretch.span(60.0), count)[(side > 0) & passes]
+        return Placements.of(_met(plan, u, np.pi, slow + 1.0), against_v_m, np.pi, slow + 1.0)
+    u = rng.uniform(8, 60, count) * rng.choice([-1, 1], count)
+    v = np.where(side < 0, plan.our_v_m - 0.1, against_v_m)
+    away = (side > 0) | (u > 12)
+    speed_m_s = np.where(side < 0, plan.speed_m_s, slow + 1.0)
+    return Placements.of(u, v, np.where(side < 0, 0.0, np.pi), speed_m_s).select(away)
+
+
 def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:
-    count = rng.poisson(_WALKERS[plan.theme])
+    count = rng.poisson(_WALKERS[plan.theme] * plan.stretch.share_around(28.0))
     side = rng.choice([-1, 1], count)
     across = np.where(side > 0, *plan.edge_m[::-1]) + np.where(side > 0, *plan.pavement_m[::-1]) * rng.uniform(
         0.3, 0.9, count
     )
     speed = np.where(rng.random(count) < 0.75, rng.uniform(0.7, 1.8, count), 0.0)
-    u = np.clip(rng.normal(0, 28, count), -80, 80)
+    u = plan.stretch.around(rng, 28.0, count)
+    if plan.stretch is Stretch.FIRST:
+        u = np.clip(u, -80, 80)
     keep = plan.in_side_street(u, side * across, 1.0) < 0
-    return Placements.of(u, side * across, rng.choice([0.0, np.pi], count), speed, rise_m=plan.level_m[0]).select(keep)
+    turn = rng.choice([0.0, np.pi], count)
+    if plan.stretch is not Stretch.FIRST:
+        speed = np.minimum(speed, _SLOWER * plan.speed_m_s)
+        u = _met(plan, u, turn, speed)
+    return Placements.of(u, side * across, turn, speed, rise_m=plan.level_m[0]).select(keep)

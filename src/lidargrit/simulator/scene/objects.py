@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Num, Shaped, UInt16
+from jaxtyping import Float32, Float64, Int, Int32, Num, Shaped, UInt16
 
 from lidargrit.simulator.mesh import Objects, Shape
 from lidargrit.simulator.scene.street_plan import StreetPlan
@@ -115,9 +115,10 @@ class ObjectBatch:
     def split(self) -> "tuple[ObjectBatch, ObjectBatch]":
         """Return those that stand and those that move."""
         moves = self.placements.speed_m_s != 0
-        return self._select(np.flatnonzero(~moves)), self._select(np.flatnonzero(moves))
+        return self.select(np.flatnonzero(~moves)), self.select(np.flatnonzero(moves))
 
-    def _select(self, which: np.ndarray) -> "ObjectBatch":
+    def select(self, which: Int[np.ndarray, " m"]) -> "ObjectBatch":
+        """Return some of them, by index."""
         albedo, label = (tuple(row[at] for at in which) for row in (self.albedo, self.label))
         shapes, placements = tuple(self.shapes[at] for at in which), self.placements.select(which)
         return ObjectBatch(shapes, self.size[which], albedo, label, self.instance[which], placements, self.leans)

@@ -1,13 +1,16 @@
 """The ground: a plan → roads, kerbs, pavements, gardens, fields, lane markings, and a bridge across."""
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.shapes import MeshBuilder, quads
-from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
+from lidargrit.simulator.scene.street_plan import StreetPlan
+from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M, Stretch
 
 _ROAD, _PAVEMENT, _PARKING, _YARD, _GREEN = range(5)
 _LABEL = np.array([classes.ROAD, classes.SIDEWALK, classes.PARKING, classes.OTHER_GROUND, classes.TERRAIN])
@@ -15,26 +18,74 @@ _MATERIAL = np.array(
     [materials.ASPHALT, materials.CONCRETE, materials.ASPHALT, materials.CONCRETE, materials.GRASS], np.uint8
 )
 _MARKED_M = 48.0  # markings farther away are seen by hardly a beam
+_PAINT_ALBEDO = 0.26  # where a first stretch has none to go on from
 _PAINT_M = 0.012  # over the road: clear of the corners that the ground's own triangles cut
 
 
-def add_ground(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
-    """Add a grid of ground whose lines run along kerbs, so that kerbs are true steps."""
-    u, v = _lines(_u_edges(plan), 8.0), _lines(_v_edges(plan), 14.0)
-    kind = _kinds(plan, rng, *np.meshgrid((u[1:] + u[:-1]) / 2, (v[1:] + v[:-1]) / 2, indexing="ij"))
+@dataclass(frozen=True, eq=False)
+class GroundLook:
+    """What stays the same along a road.
+
+    Args:
+        bays: whether parked rows stand on a strip of their own, right and left.
+        bright: albedo of road, pavement, parking, yards and grass.
+        kerb: albedo of kerbs.
+    """
+
+    bays: Bool[np.ndarray, "2"]
+    bright: Float[np.ndarray, "5"]
+    kerb: float
+
+
+@dataclass(frozen=True)
+class PaintLook:
+    """What markings look like along a road: every how manieth dash is painted, 0 for none, and their albedo."""
+
+    every: int
+    bright: float
+
+
+def add_ground(
+    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, like: GroundLook | None = None
+) -> GroundLook:
+    """Add a grid of ground whose lines run along kerbs, so that kerbs are true steps.
+
+    Args:
+        like: look of the stretch before; sampled if not given.
+
+    Returns:
+        the look of this stretch.
+    """
+    further = plan.stretch is Stretch.FURTHER
+    u = _even_lines(_u_edges(plan)) if further else _lines(_u_edges(plan), 8.0)
+    v = _lines(_v_edges(plan), 14.0)
+    bays = like.bays if like else rng.random(2) < 0.35
+    kind = _kinds(plan, rng, bays, *np.meshgrid((u[1:] + u[:-1]) / 2, (v[1:] + v[:-1]) / 2, indexing="ij"))
     level = np.array([0.0, plan.level_m[0], 0.0, plan.level_m[1], plan.level_m[1]])[kind]
     base = plan.ground_points(*np.meshgrid(u, v, indexing="ij"))
-    base[..., 2] += _rough(rng, kind)
+    rough = _rough(rng, kind)
+    if further:
+        rough[[0, -1]] = 0  # where it meets other stretches
+    base[..., 2] += rough
     corners = np.stack((base[:-1, :-1], base[1:, :-1], base[1:, 1:], base[:-1, 1:]), axis=2)
     corners[..., 2] += level[..., None]
-    bright = np.array(
-        [rng.uniform(*span) for span in ((0.1, 0.25), (0.2, 0.4), (0.12, 0.25), (0.15, 0.35), (0.3, 0.5))]
-    )
+    spans = (0.1, 0.25), (0.2, 0.4), (0.12, 0.25), (0.15, 0.35), (0.3, 0.5)
+    bright = like.bright if like else np.array([rng.uniform(*span) for span in spans])
     albedo = bright[kind] * rng.uniform(0.94, 1.06, kind.shape)
     builder.add(quads(corners), _MATERIAL[kind][..., None], albedo[..., None], _LABEL[kind][..., None])
-    kerb = rng.uniform(0.25, 0.4)
+    kerb = like.kerb if like else rng.uniform(0.25, 0.4)
     for axis in (0, 1):
         _add_kerbs(builder, base, level, axis, kerb)
+    return GroundLook(bays, bright, kerb)
+
+
+def _even_lines(edges: np.ndarray) -> np.ndarray:
+    """Fill the length of a further stretch with lines that are dense all along."""
+    stops = np.unique(np.concatenate((edges, [-LENGTH_M / 2, LENGTH_M / 2])))
+    stops = stops[np.concatenate(([True], np.diff(stops) > 0.02))]
+    pieces = [np.linspace(low, high, max(int(np.ceil((high - low) / 4.0)), 1), endpoint=False)
+              for low, high in pairwise(stops)]  # fmt: skip
+    return np.concatenate((*pieces, [LENGTH_M / 2]))
 
 
 def _lines(edges: np.ndarray, far_m: float) -> np.ndarray:
@@ -76,8 +127,7 @@ def _v_edges(plan: StreetPlan) -> np.ndarray:
     return np.array(edges)
 
 
-def _kinds(plan: StreetPlan, rng: np.random.Generator, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    bays = rng.random(2) < 0.35  # some parked rows stand on a strip of their own
+def _kinds(plan: StreetPlan, rng: np.random.Generator, bays: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     green = {"city": 0.25, "suburb": 0.6, "country": 1.0}[plan.theme]
     block = (np.floor(u / 17.0) * 7 + np.floor(v / 23.0)).astype(int) % 64
     kind = np.where((rng.random(64) < green)[block], _GREEN, _YARD)
@@ -116,19 +166,31 @@ def _add_kerbs(builder: MeshBuilder, base: np.ndarray, level: np.ndarray, axis: 
     builder.add(quads(np.stack((start, end, end, start), axis=1) + rise), materials.CONCRETE, albedo, classes.SIDEWALK)
 
 
-def add_markings(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan) -> None:
-    """Paint the middle of the road, its edges out of town, and stop lines and zebra crossings at junctions."""
+def add_markings(
+    builder: MeshBuilder, rng: np.random.Generator, plan: StreetPlan, like: PaintLook | None = None
+) -> PaintLook:
+    """Paint the middle of the road, its edges out of town, and stop lines and zebra crossings at junctions.
+
+    Args:
+        like: look of the stretch before; sampled if not given.
+
+    Returns:
+        the look of this stretch.
+    """
     bars: list[np.ndarray] = []  # columns: u from, u to, v from, v to
-    along = np.arange(-_MARKED_M, _MARKED_M, 3.0)
-    if plan.lanes == 2 and rng.random() < {"city": 0.8, "suburb": 0.4, "country": 0.9}[plan.theme]:
-        dashes = along[:: int(rng.choice([1, 2, 3]))]
+    along = np.arange(*plan.stretch.span(_MARKED_M), 3.0)
+    every = like.every if like else 0
+    if not like and plan.lanes == 2 and rng.random() < {"city": 0.8, "suburb": 0.4, "country": 0.9}[plan.theme]:
+        every = int(rng.choice([1, 2, 3]))
+    if every:
+        dashes = along[::every]
         bars.append(np.column_stack((dashes, dashes + 3.0, dashes * 0 - 0.06, dashes * 0 + 0.06)))
     if plan.theme == "country":
         for side in (-1, 1):
             line = along * 0 + plan.edge(side) - side * 0.3
             bars.append(np.column_stack((along, along + 3.0, line - 0.06, line + 0.06)))
     for street in plan.side_streets:
-        if abs(street.u_m) > _MARKED_M:
+        if not plan.stretch.keeps(np.array([street.u_m]), _MARKED_M)[0]:
             continue
         for side in street.sides:
             kerb = plan.edge(side)
@@ -139,14 +201,14 @@ def add_markings(builder: MeshBuilder, rng: np.random.Generator, plan: StreetPla
             bars.append(_zebra(plan, street.u_m + rng.choice([-1, 1]) * (street.half_m + street.pavement_m + 2.5)))
     clear = [bar[plan.in_side_street(bar[:, 0], bar[:, 2]) < 0] for bar in bars[:1]] + bars[1:]
     if not clear:
-        return
+        return like or PaintLook(every, _PAINT_ALBEDO)
     bar = np.concatenate(clear)
     corners = plan.ground_points(bar[:, [0, 1, 1, 0]], bar[:, [2, 2, 3, 3]])
     corners[..., 2] += _PAINT_M
-    bright = rng.uniform(0.2, 0.32) * rng.uniform(
-        0.85, 1.0, (len(bar), 1)
-    )  # KITTI's read .37, half as much as road again
-    builder.add(quads(corners), materials.ASPHALT, bright, classes.LANE_MARKING)
+    bright = like.bright if like else rng.uniform(0.2, 0.32)  # KITTI's read .37, half as much as road again
+    albedo = bright * rng.uniform(0.85, 1.0, (len(bar), 1))
+    builder.add(quads(corners), materials.ASPHALT, albedo, classes.LANE_MARKING)
+    return PaintLook(every, bright)
 
 
 def _zebra(plan: StreetPlan, u_m: float) -> np.ndarray:

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float, Num
 from lidargrit.simulator import materials
 from lidargrit.simulator.scene.buildings import Houses
 from lidargrit.simulator.scene.objects import Placements
-from lidargrit.simulator.scene.street_plan import EXTENT_M, StreetPlan
+from lidargrit.simulator.scene.street_plan import StreetPlan
+from lidargrit.simulator.scene.stretches import EXTENT_M, Stretch
 
 _LENGTH_M = {"city": (8.0, 20.0), "suburb": (7.5, 14.0), "country": (9.0, 18.0)}
 _DEPTH_M = {"city": (9.0, 13.0), "suburb": (7.5, 11.0), "country": (8.0, 14.0)}
@@ -18,6 +19,8 @@ _GAP_M = {"city": (2.5, 9.0), "suburb": (2.5, 9.0), "country": (10.0, 90.0)}
 _BEHIND = {"city": 0.85, "suburb": 0.8, "country": 0.1}  # share of the places behind the rows that are built on
 _PARK_CHANCE = {"city": 0.07, "suburb": 0.13, "country": 0.3}
 _LATTICE_M = 24.0
+# How far from the middle of a stretch houses stand along side streets; those of further ones end within them.
+_BESIDE_TO_M = {Stretch.FIRST: 122.0, Stretch.FURTHER: Stretch.FURTHER.built_m - 7.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +29,7 @@ class Settlement:
 
     Args:
         houses: all houses of the scene.
-        boxes_m: bounds of each house: lowest u, highest u, lowest v, highest v.
+        boxes_m: bounds of each house, and of some of the stretch before: lowest u, highest u, lowest v, highest v.
         gaps_m: gaps in the rows of houses along our road: first u, last u and side.
         parks_m: stretches without houses: first u, last u and side.
     """
@@ -55,16 +58,22 @@ def free_spans(plan: StreetPlan, side: int, spare_m: float = 0.5) -> list[tuple[
     ]
     if np.isfinite(plan.bridge_u_m):
         taken.append((plan.bridge_u_m, 13.0 + spare_m))  # its banks
-    spans, start = [], -EXTENT_M + 5
+    spans, start = [], -plan.stretch.built_m
     for middle, half in sorted(taken):
         if middle - half - start > 4:
             spans.append((start, middle - half))
         start = max(start, middle + half)
-    return [*spans, (start, EXTENT_M - 5)]
+    return [*spans, (start, plan.stretch.built_m)]
 
 
-def lay_out_houses(rng: np.random.Generator, plan: StreetPlan) -> Settlement:
-    """Sample where houses stand."""
+def lay_out_houses(
+    rng: np.random.Generator, plan: StreetPlan, taken_m: Float[np.ndarray, "n 4"] | None = None
+) -> Settlement:
+    """Sample where houses stand.
+
+    Args:
+        taken_m: bounds of houses of the stretch before, some of which may lie in this one.
+    """
     rows, gaps, parks = [], [np.zeros((0, 3))], [np.zeros((0, 3))]
     for side in (-1, 1):
         for span in free_spans(plan, side):
@@ -88,8 +97,14 @@ def lay_out_houses(rng: np.random.Generator, plan: StreetPlan) -> Settlement:
     extents = np.concatenate([b[1] for b in blocks])
     size = np.concatenate([b[2] for b in blocks])
     plain = np.concatenate([np.full(len(b[0]), b is garages) for b in blocks])
+    if taken_m is not None:
+        apart = (extents[:, None, [0, 2]] > taken_m[:, [1, 3]]) | (extents[:, None, [1, 3]] < taken_m[:, [0, 2]])
+        free = ~np.any(~np.any(apart, axis=2), axis=1)
+        placements, size, plain = placements.select(free), size[free], plain[free]
+        extents = extents[free]
     houses = _sample_houses(rng, plan, placements, size, plain)
-    return Settlement(houses, extents, np.concatenate(gaps), np.concatenate(parks))
+    boxes = extents if taken_m is None else np.concatenate((extents, taken_m))
+    return Settlement(houses, boxes, np.concatenate(gaps), np.concatenate(parks))
 
 
 def _row(rng: np.random.Generator, theme: str, span: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +155,9 @@ def _stand_beside(
     u_near, u_far = street.u_m + flank * front, street.u_m + flank * (front + depth)
     others = np.array([s.u_m for s in plan.side_streets if s is not street and side in s.sides])
     middle_u = (u_near + u_far) / 2
-    clear = (np.abs(middle_u[:, None] - others) > depth[:, None] / 2 + 6.0).all(axis=1) & (np.abs(middle_u) < 122)
+    clear = (np.abs(middle_u[:, None] - others) > depth[:, None] / 2 + 6.0).all(axis=1) & (
+        np.abs(middle_u) < _BESIDE_TO_M[plan.stretch]
+    )
     if np.isfinite(plan.bridge_u_m):
         clear &= (np.abs(middle_u - plan.bridge_u_m) > 18) | (start > 75)
     placements = Placements.of(middle_u, side * (start + length / 2), np.pi if flank > 0 else 0.0, across=True)
@@ -170,7 +187,8 @@ def _stand_behind(
 ) -> tuple[Placements, np.ndarray, np.ndarray]:
     """Build here and there behind the rows, as a backdrop; blocks of a city are large."""
     line = np.arange(-EXTENT_M + 8, EXTENT_M, _LATTICE_M)
-    u, v = (a.ravel() for a in np.meshgrid(line, line))
+    along = np.arange(-plan.stretch.half_m + 8, plan.stretch.half_m, _LATTICE_M)
+    u, v = (a.ravel() for a in np.meshgrid(along, line))
     u, v = u + rng.uniform(-5, 5, len(u)), v + rng.uniform(-5, 5, len(v))
     size = rng.uniform(8, 15 if plan.theme != "city" else 21, (len(u), 2))
     reach = size.max(axis=1) / 2
@@ -178,6 +196,8 @@ def _stand_behind(
     pavement = max((s.pavement_m for s in plan.side_streets), default=0.0)
     free = (rng.random(len(u)) < _BEHIND[plan.theme]) & (behind > reach + 3)
     free &= ~_covered(taken, u, v, reach + 1.0) & (plan.in_side_street(u, v, pavement) < -reach)
+    if plan.stretch is Stretch.FURTHER:
+        free &= np.abs(u) < plan.stretch.built_m - reach
     if np.isfinite(plan.bridge_u_m):
         free &= np.abs(u - plan.bridge_u_m) > 13 + reach
     u, v, size = u[free], v[free], size[free]

@@ -46,6 +46,8 @@ class MeshBuilder:
 
     def build(self) -> Mesh:
         """Return all that was added, in order."""
+        if not self._parts:
+            return Mesh.of(np.zeros((0, 3, 3)), 0, 0.0, 0)
         triangles_m, material, albedo, label, instance = (np.concatenate(c) for c in zip(*self._parts, strict=True))
         return Mesh(material, albedo, label, instance, triangles_m)
 

@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Num, Shaped
 
 from lidargrit.simulator.scene.shapes import blocks
+from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M, Stretch
 
 Theme = Literal["city", "suburb", "country", "mixed"]
-EXTENT_M = 125.0  # a little more than the 120 m that the sensor sees
 _PARKING_M = 2.1  # width of a parked row
 _PARK_CHANCE = {"city": (0.65, 0.65), "suburb": (0.5, 0.5), "country": (0.0, 0.0)}  # right, left
 _LANE_M = {"city": (2.9, 3.7), "suburb": (2.7, 3.4), "country": (2.8, 3.4)}
@@ -28,6 +28,8 @@ _SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)
 _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
 _VIEWPOINT_SPACING_M = 6.0  # at most, along our car's way
 _SKEW_REACH_M, _SKEW_WIDTH_M = 25.0, 25.0  # how far from our road, and from its mouth, a side street runs askew
+
+_FROM_END_M, _SKEW_FROM_END_M = 26.0, 75.0  # side streets, and those askew, to the end of their further stretch
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +74,23 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
+class Place:
+    """Place of a further stretch in the world of its drive, whose own world is that one, moved and not turned.
+
+    Args:
+        heading_rad: heading of the drive's world in the frame of the line.
+        foot_m: height of the ground below our wheels where the drive begins.
+        offset_m: where the stretch's own world begins in the drive's.
+    """
+
+    heading_rad: float
+    foot_m: float
+    offset_m: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, eq=False)
 class StreetPlan:
-    """Plan of one street, in street coordinates.
+    """Plan of one stretch of a street, in street coordinates.
 
     Args:
         theme: kind of street: city, suburb or country.
@@ -93,7 +110,11 @@ class StreetPlan:
         banks_m: rise of the ground beside the road, right and left.
         level_m: heights of pavements and of gardens or fields above the road.
         speed_m_s: speed of our own car.
-        viewpoints_m: positions of our car in the first seconds, in world coordinates; fine detail is made near them.
+        stretch: which stretch this is.
+        neighbours: side streets of the stretches beside this one, which bend it a little.
+        place: place of a further stretch; the first one's world is the drive's.
+        viewpoints_m: positions of our car in the first seconds, or all along the rest of the road, in world
+            coordinates; fine detail is made near them.
     """
 
     theme: str
@@ -113,21 +134,42 @@ class StreetPlan:
     banks_m: tuple[float, float]
     level_m: tuple[float, float]
     speed_m_s: float
+    stretch: Stretch = Stretch.FIRST
+    neighbours: tuple[SideStreet, ...] = ()
+    place: Place | None = None
     viewpoints_m: Float[np.ndarray, "k 2"] = field(init=False, repr=False)
     _origin: tuple[np.ndarray, float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        here, ahead = self._bent(np.array([0.0, 1.0]), np.full(2, self.our_v_m))
-        heading = np.arctan2(*(ahead - here)[::-1])
-        object.__setattr__(self, "_origin", (here, float(heading), 0.0))
-        foot_m = float(self.height_m(np.zeros(1), np.array([self.our_v_m]))[0])
-        object.__setattr__(self, "_origin", (here, float(heading), foot_m))
-        way = self.speed_m_s * _LOOKS_FOR_S
-        u = np.linspace(0.0, way, 1 + int(np.ceil(way / _VIEWPOINT_SPACING_M)))
+        if self.place:
+            foot_m = self.place.foot_m + float(self.place.offset_m[2])
+            object.__setattr__(self, "_origin", (np.zeros(2), self.place.heading_rad, foot_m))
+        else:
+            here, ahead = self._bent(np.array([0.0, 1.0]), np.full(2, self.our_v_m))
+            heading = np.arctan2(*(ahead - here)[::-1])
+            object.__setattr__(self, "_origin", (here, float(heading), 0.0))
+            foot_m = float(self.height_m(np.zeros(1), np.array([self.our_v_m]))[0])
+            object.__setattr__(self, "_origin", (here, float(heading), foot_m))
+        start, way = {
+            Stretch.FIRST: (0.0, self.speed_m_s * _LOOKS_FOR_S),
+            Stretch.REST: (0.0, EXTENT_M),
+            Stretch.FURTHER: (-LENGTH_M / 2, LENGTH_M),
+        }[self.stretch]
+        u = np.linspace(start, start + way, 1 + int(np.ceil(way / _VIEWPOINT_SPACING_M)))
         object.__setattr__(self, "viewpoints_m", self._flat(u, np.full(len(u), self.our_v_m)))
 
+    @property
+    def offset_m(self) -> Float[np.ndarray, "3"]:
+        """Where the world of this stretch begins in that of its drive."""
+        return self.place.offset_m if self.place else np.zeros(3)
+
+    @property
+    def own_streets(self) -> tuple[SideStreet, ...]:
+        """Side streets beside which things are still to be laid out."""
+        return () if self.stretch is Stretch.REST else self.side_streets
+
     def nearest_approach_m(self, points_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
-        """Return the smallest distance of our car from points in the first seconds, the same for all frames."""
+        """Return the smallest distance of our car from points, the same for all frames; see ``viewpoints_m``."""
         apart = points_m[:, :2] - self.viewpoints_m[:, None]
         return np.sqrt((apart[..., 0] ** 2 + apart[..., 1] ** 2).min(axis=0))
 
@@ -201,17 +243,24 @@ class StreetPlan:
                 inside = np.maximum(inside, np.where(np.asarray(v_m) * side > 0, depth, -np.inf))
         return inside
 
+    def place_of(self, point_m: Float[np.ndarray, "2"]) -> Place:
+        """Return the place of a further stretch whose own world begins at a point, in the frame of the line."""
+        here, heading_rad, foot_m = self._origin
+        cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+        flat = (point_m - here) @ np.array([[cos, -sin], [sin, cos]])
+        return Place(heading_rad, foot_m, np.array([*flat, self._ground(flat) - foot_m]))
+
     def _bent(self, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
         u = np.asarray(u_m, np.float64)
         v = np.asarray(v_m, np.float64)
-        for street in self.side_streets:
+        for street in (*self.side_streets, *self.neighbours):
             if street.skew:
                 reach = _SKEW_REACH_M * np.tanh(v / _SKEW_REACH_M)
                 u = u + street.skew * reach * np.exp(-(((np.asarray(u_m) - street.u_m) / _SKEW_WIDTH_M) ** 2))
         knots = self.line
         step = knots[1, 0] - knots[0, 0]
-        position = np.clip((u - knots[0, 0]) / step, 0, len(knots) - 1.001)
-        left = position.astype(np.intp)
+        position = (u - knots[0, 0]) / step
+        left = np.clip(position, 0, len(knots) - 1.001).astype(np.intp)  # beyond its ends the line goes straight on
         share = (position - left)[..., None]
         near = knots[left]
         both = near + (knots[left + 1] - near) * share
@@ -227,6 +276,8 @@ class StreetPlan:
         return away @ np.array([[cos, -sin], [sin, cos]])
 
     def _ground(self, flat: np.ndarray) -> np.ndarray:
+        if self.place:
+            flat = flat + self.place.offset_m[:2]
         phase = flat @ self.waves[:, 1:3].T + self.waves[:, 3]
         return np.sin(phase) @ self.waves[:, 0] + flat @ self.tilt
 
@@ -254,9 +305,7 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
     setback += np.where(rng.random(2) < _OPEN_CHANCE[kind], rng.uniform(*_OPEN_M, 2), 0.0)
     pavement = rng.uniform(*_PAVEMENT_M[kind], 2)
     streets = _sample_side_streets(rng, kind)
-    bridge = rng.uniform(14, 70) * rng.choice([-1, 1]) if rng.random() < 0.06 else np.inf
-    if any(abs(street.u_m - bridge) < 22 for street in streets):
-        bridge = np.inf
+    bridge = sample_bridge(rng, streets)
     wild = kind == "country"
     return StreetPlan(
         theme=kind,
@@ -268,7 +317,7 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
         setback_m=(float(setback[0]), float(setback[1])),
         our_v_m=-lane / 2 * rng.uniform(0.7, 1.02) if lanes == 2 else rng.uniform(-0.2, 0.2),
         side_streets=streets,
-        bridge_u_m=float(bridge),
+        bridge_u_m=bridge,
         line=_sample_line(rng, kind),
         waves=_sample_waves(rng),
         tilt=rng.normal(0, 0.016, 2),
@@ -277,6 +326,25 @@ def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
         level_m=(0.0, -0.03) if wild else (rng.uniform(0.06, 0.15), rng.uniform(0.1, 0.25)),
         speed_m_s=0.0 if rng.random() < 0.15 else float(rng.uniform(*_SPEED_M_S[kind])),
     )
+
+
+def sample_bridge(rng: np.random.Generator, streets: tuple[SideStreet, ...], to_m: float = 70.0) -> float:
+    """Sample where another road crosses above ours, within a distance and clear of side streets; mostly nowhere."""
+    bridge = rng.uniform(14, to_m) * rng.choice([-1, 1]) if rng.random() < 0.06 else np.inf
+    return np.inf if any(abs(street.u_m - bridge) < 22 for street in streets) else float(bridge)
+
+
+def sample_further_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
+    """Sample the side streets of a further stretch; near its ends none is askew, so that all stretches fit."""
+    streets: list[SideStreet] = []
+    for _ in range(min(rng.poisson(_SIDE_STREETS[kind] * Stretch.FURTHER.share_around(42.0)), 8)):
+        u = rng.uniform(-1, 1) * (LENGTH_M / 2 - _FROM_END_M)
+        skew = np.clip(rng.normal(0, 0.25), -0.5, 0.5) if abs(u) < LENGTH_M / 2 - _SKEW_FROM_END_M else 0.0
+        sides = ((-1, 1), (1,), (-1,))[rng.choice(3, p=[0.4, 0.3, 0.3])]
+        half, pavement = rng.uniform(2.3, 4.0), 0.0 if kind == "country" else rng.uniform(1.0, 2.2)
+        if all(abs(u - other.u_m) > 32 for other in streets):
+            streets.append(SideStreet(u, half, pavement, sides, float(skew)))
+    return tuple(streets)
 
 
 def _sample_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
