@@ -186,14 +186,13 @@ class PixelDecoder(RayNetwork):
         guide = self.guide(decoded, len(images))
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
-        weight = 1 + (self.config.narrow_weight - 1) * guide.narrow() if self.training else torch.ones_like(guide.v)
         returns, rng = guide.v.new_zeros(()), of_host(rng)
         for phases in self.mask.by_lattice():
             chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
             of_mask, of_range = self._nll(chosen, guided, guide, images)
-            share, of_chosen = len(phases) / len(chosen), at_phases(weight, chosen)
-            mask_nats = mask_nats + share * (of_chosen * of_mask).sum()
-            range_nats = range_nats + share * (of_chosen * of_range).sum()
+            share = len(phases) / len(chosen)
+            mask_nats = mask_nats + share * of_mask.sum()
+            range_nats = range_nats + share * of_range.sum()
             returns = returns + share * at_phases(images.return_mask, chosen).sum()
         if self.training:  # as many returns as one process with the whole batch would divide by, for each process
             returns = mean_over_processes(returns)

@@ -37,7 +37,6 @@ LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good 
 _HALVINGS_AT_MOST = 8  # of one side alone
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _DECODED_LOG_SCALE_M = -3.0  # 5 cm
-_NARROW_COLUMNS, _NARROW_V = 8, 0.1  # how far the sides of something narrow are, and what lies behind it
 _NEVER = -60.0  # logit of a return in rows that a sensor does not have
 
 
@@ -71,9 +70,6 @@ class PixelDecoderConfig(Settings):
         weighed_components: whether all other components are weighed by the probability that the decoded distribution
             gives to ranges near them, so that a wall does not take the pixels of a pole of which the tokens tell; needs
             ``decoded_components``.
-        narrow_weight: number of times that a pixel counts in training of which the tokens tell something narrow, nearer
-            than what lies left and right of it, such as a pole; these are one in 20. The best distribution stays the
-            same, since the weight depends on nothing but what is decoded, but a short training nears it there, too.
         any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
             are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
             largest, and smaller images begin with smaller cells.
@@ -95,7 +91,6 @@ class PixelDecoderConfig(Settings):
     gravity_components: bool = False
     decoded_components: bool = False
     weighed_components: bool = False
-    narrow_weight: Annotated[float, Bounds(1, 1000)] = 1.0
     any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
 
@@ -164,14 +159,6 @@ class Guide(NamedTuple):
         if components is None:
             components = torch.stack((torch.zeros_like(v), v, _DECODED_LOG_SCALE_M - v), 1)[:, :, None]
         return cls(at_least_32_bits(decoded.features), v, logits, None, at_least_32_bits(components), told)
-
-    def narrow(self) -> Bool[Tensor, "B H W"]:
-        """Return where what is decoded is nearer than something within eight columns on both sides."""
-        columns = self.v.shape[-1]
-        around = torch.arange(-_NARROW_COLUMNS, columns + _NARROW_COLUMNS, device=self.v.device) % columns
-        farthest = F.max_pool2d(self.v[..., around], (1, _NARROW_COLUMNS), 1)
-        behind = torch.minimum(farthest[..., :columns], farthest[..., -columns:])
-        return behind - self.v > _NARROW_V
 
     @classmethod
     def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> "Guide":
