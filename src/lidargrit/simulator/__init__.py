@@ -63,7 +63,7 @@ def simulate(
         sensor: sensor to simulate, with every column that it fires; the HDL-64E of KITTI odometry if not given.
         theme: kind of street.
         frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street.
-        frames: how many frames of the drive are wanted; 1 means as many as it takes to get to ``frame``. A street of
+        frames: number of the drive's frames that are wanted; 1 for as many as it takes to get to ``frame``. A street of
             which 100 m are driven ends 125 m from its start. A longer drive goes on through further stretches of the
             road, and its first frames see them, too, so that nothing appears from one frame to the next: give all
             frames of one drive the same number.

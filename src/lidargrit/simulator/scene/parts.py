@@ -25,7 +25,7 @@ class Parts:
         standing: triangles that are of this street alone: its ground, its houses, its walls and fences.
         still: kept objects that never move.
         moving: kept objects that do.
-        town: where houses stand.
+        town: places of houses.
         ground: look of the ground, which further stretches share.
         paint: look of the markings, which further stretches share.
     """

@@ -80,7 +80,7 @@ class Place:
     Args:
         heading_rad: heading of the drive's world in the frame of the line.
         foot_m: height of the ground below our wheels where the drive begins.
-        offset_m: where the stretch's own world begins in the drive's.
+        offset_m: place in the drive's world at which the stretch's own begins.
     """
 
     heading_rad: float
@@ -110,7 +110,7 @@ class StreetPlan:
         banks_m: rise of the ground beside the road, right and left.
         level_m: heights of pavements and of gardens or fields above the road.
         speed_m_s: speed of our own car.
-        stretch: which stretch this is.
+        stretch: kind of this stretch of the road.
         neighbours: side streets of the stretches beside this one, which bend it a little.
         place: place of a further stretch; the first one's world is the drive's.
         viewpoints_m: positions of our car in the first seconds, or all along the rest of the road, in world
