@@ -171,42 +171,9 @@ def test_what_neighbours_suggest_is_weighed_by_the_probability_that_the_tokens_g
     assert share[1] < 0.25 * share[0]
 
 
-def test_a_share_of_what_is_known_in_training_is_drawn_from_what_the_tokens_tell():
-    tokenizer, images = NearestRangeTokenizer(CONFIG, SENSOR).eval(), a_pole_before_a_wall()
-    sizes = SENSOR, tokenizer.num_features, tokenizer.num_components
-    pixels = PixelDecoder(replace(PIXELS, drawn_context=0.8), *sizes)
-    with torch.no_grad():
-        decoded = tokenizer.decode(tokenizer.encode(images))
-    many = RangeImage.cat([images] * 64)
-    guide = pixels.guide(replace(decoded, **{name: value.repeat(64, *[1] * (value.ndim - 1)) for name, value in (
-        ("range_m", decoded.range_m), ("return_logits", decoded.return_logits), ("features", decoded.features),
-        ("components", decoded.components))}), 64)  # fmt: skip
-    drawn_m = guide.drawn(torch.Generator().manual_seed(0), (SENSOR.range_min_m, SENSOR.range_max_m))
-    logits, centres, log_scales = decoded.components[0, :, :, 20, 2].double()
-    expected = sum(  # of a mixture of logistic distributions of ln(1 + range)
-        float(share) / (1 + math.exp(-(math.log1p(29.0) - float(centre)) / math.exp(float(log_scale))))
-        for share, centre, log_scale in zip(logits.softmax(0), centres, log_scales, strict=True)
-    )
-    below = drawn_m[:, 16:24, :4] < 29  # the cell of eight rows and four columns around it, which decodes alike
-    assert float(below.float().mean()) == pytest.approx(expected, abs=0.05)
-    known_m = pixels._partly_drawn(guide, many, torch.Generator().manual_seed(1))
-    changed = (known_m != many.range_m).float().mean((1, 2))
-    assert float(changed.mean()) == pytest.approx(0.4, abs=0.08)
-    assert float(changed.max()) < 0.82
-    rng, learned = torch.Generator().manual_seed(2), []
-    for training in (True, False):  # what is told in validation is of true neighbours
-        losses = [float(pixels.train(training).estimate(decoded, images, rng.manual_seed(3))[1].detach())]
-        pixels.config = PIXELS
-        losses.append(float(pixels.estimate(decoded, images, rng.manual_seed(3))[1].detach()))
-        pixels.config = replace(PIXELS, drawn_context=0.8)
-        learned.append(losses[0] == losses[1])
-    assert learned == [False, True]
-
-
-@pytest.mark.parametrize("changes", [{"weighed_components": True}, {"drawn_context": 0.5}])
-def test_what_needs_a_decoded_distribution_is_refused_without_one(changes):
-    with pytest.raises(ConfigError, match="without decoded_components"):
-        PixelDecoderConfig(**changes)
+def test_candidates_are_not_weighed_where_nothing_is_decoded_by_which_they_could_be():
+    with pytest.raises(ConfigError, match="weighed_components without decoded_components"):
+        PixelDecoderConfig(weighed_components=True)
 
 
 def test_the_mode_of_a_mixture_is_its_densest_centre():

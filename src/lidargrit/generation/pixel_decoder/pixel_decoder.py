@@ -184,13 +184,12 @@ class PixelDecoder(RayNetwork):
         """
         pixels, images = images.range_m.numel(), self._whole(images)
         guide = self.guide(decoded, len(images))
-        known_m = self._partly_drawn(guide, images, rng) if self.training and self.config.drawn_context else None
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns, rng = guide.v.new_zeros(()), of_host(rng)
         for phases in self.mask.by_lattice():
             chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
-            of_mask, of_range = self._nll(chosen, guided, guide, images, known_m=known_m)
+            of_mask, of_range = self._nll(chosen, guided, guide, images)
             share = len(phases) / len(chosen)
             mask_nats = mask_nats + share * of_mask.sum()
             range_nats = range_nats + share * of_range.sum()
@@ -209,15 +208,9 @@ class PixelDecoder(RayNetwork):
         return self.mask.flops() + self.range.flops()
 
     def _nll(
-        self,
-        phases: list[Phase],
-        guided: _Guided,
-        guide: Guide,
-        images: RangeImage,
-        steps: RangeSteps | None = None,
-        known_m: Float[Tensor, "B H W"] | None = None,
+        self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage, steps: RangeSteps | None = None
     ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
-        mask, v = images.return_mask, (images.range_m if known_m is None else known_m).log1p()
+        mask, v = images.return_mask, images.range_m.log1p()
         returned = at_phases(mask, phases)
         of_mask = self.mask.phase_nll(phases, guided[0], guide, mask)
         # Where nothing returned, any range within the limits stands in: its likelihood is not used.
@@ -228,14 +221,6 @@ class PixelDecoder(RayNetwork):
         else:
             likelihood = mixture.log_mass(*steps.edges_m(steps.indices(range_m))).float()
         return of_mask, torch.where(returned, -likelihood, 0.0)
-
-    def _partly_drawn(self, guide: Guide, images: RangeImage, rng: torch.Generator) -> Float[Tensor, "B H W"]:
-        """Return the ranges of scans, of which a random share is drawn from the decoded distribution."""
-        chances = torch.rand(guide.v.shape, generator=rng, device=rng.device).to(guide.v.device)
-        shares = torch.rand((len(images), 1, 1), generator=rng, device=rng.device).to(guide.v.device)
-        chosen = (chances < self.config.drawn_context * shares) & images.return_mask
-        chosen = chosen if guide.told is None else chosen & guide.told
-        return torch.where(chosen, guide.drawn(rng, self.range.limits_m), images.range_m)
 
     def sample(
         self,

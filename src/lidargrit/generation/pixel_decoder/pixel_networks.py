@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.typed_values import Bounds, Count, NotNegative, ShareBelow1
+from lidargrit.core.typed_values import Bounds, Count, NotNegative
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
@@ -26,7 +26,6 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
     one_of_phases,
     phases_of,
 )
-from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.pixel_decoder.ray_encoding import LEAST_CELL, RowEncoding, coarsest_cell_of
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.nn.random import of_host, rngs_of
@@ -71,9 +70,6 @@ class PixelDecoderConfig(Settings):
         weighed_components: whether all other components are weighed by the probability that the decoded distribution
             gives to ranges near them, so that a wall does not take the pixels of a pole of which the tokens tell; needs
             ``decoded_components``.
-        drawn_context: largest share of the earlier ranges that training takes from the decoded distribution in place of
-            the scan. A pixel is sampled beside sampled ones, which are not always right: with 0 the networks rely on
-            neighbours more than on the tokens, and samples drift from these.
         any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
             are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
             largest, and smaller images begin with smaller cells.
@@ -95,17 +91,15 @@ class PixelDecoderConfig(Settings):
     gravity_components: bool = False
     decoded_components: bool = False
     weighed_components: bool = False
-    drawn_context: ShareBelow1 = 0.0
     any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
 
     def __post_init__(self) -> None:
         super().__post_init__()
         phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
-        for name, value in (("weighed_components", self.weighed_components), ("drawn_context", self.drawn_context)):
-            if value and not self.decoded_components:
-                got = f"{name}={value} without decoded_components"
-                raise ConfigError(got, "both, or neither", "set decoded_components=true")
+        if self.weighed_components and not self.decoded_components:
+            got = "weighed_components without decoded_components"
+            raise ConfigError(got, "both, or neither", "set decoded_components=true")
         if self.any_sensor and (self.column_halvings or self.row_halvings):
             got = f"any_sensor with column_halvings={self.column_halvings} and row_halvings={self.row_halvings}"
             raise ConfigError(got, "square cells, which all sensors share", "leave them out, or any_sensor")
@@ -165,14 +159,6 @@ class Guide(NamedTuple):
         if components is None:
             components = torch.stack((torch.zeros_like(v), v, _DECODED_LOG_SCALE_M - v), 1)[:, :, None]
         return cls(at_least_32_bits(decoded.features), v, logits, None, at_least_32_bits(components), told)
-
-    @torch.no_grad()
-    def drawn(self, rng: torch.Generator, limits_m: tuple[float, float]) -> Float[Tensor, "B H W"]:
-        """Return a range of every pixel, in metres, sampled from the decoded distribution."""
-        assert self.components is not None
-        logits, centres, log_scales = self.components.movedim(2, -1).unbind(1)
-        component, within = torch.rand((2, *self.v.shape), generator=rng, device=rng.device).to(self.v.device)
-        return RangeMixture(logits, centres, log_scales, limits_m).sample(component, within)
 
     @classmethod
     def nothing(cls, like: Tensor, count: int, sensor: SensorModel) -> "Guide":
