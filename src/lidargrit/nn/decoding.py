@@ -145,15 +145,19 @@ class CachedDecoder:
 
         if position:
             self._generated[:, position - 1] = tokens
-        x = self._embedded(tokens, self._positions[position], torch.tensor([position], device=self._device))
+        places = None if self._around is None else self._around.places[position]
+        x = self._embedded(tokens, self._positions[position], places)
         return self._logits(x, self._cache[:, :, :, : position + 1], write_cache)
 
-    def _embedded(self, tokens: Tensor, own: Tensor, position: Tensor) -> Tensor:
-        """Return the sum of what the previous token, the position and the tokens around it are embedded as."""
+    def _embedded(self, tokens: Tensor, own: Tensor, places: Tensor | None) -> Tensor:
+        """Return the sum of what the previous token, the position and the tokens around it are embedded as.
+
+        Args:
+            places: places of the tokens around, counted from the start token; the last is none.
+        """
         x = F.embedding(tokens, self._embedding) + own
-        if self._around is None:
+        if self._around is None or places is None:
             return x
-        places = self._around.places.index_select(0, position)[0]  # behind the start token; the last is none
         around = F.pad(self._generated, (1, 0)).index_select(1, places)
         around = torch.where(places < self._length, around, -1)
         return x + self._around.added(around, self._tables)
@@ -192,7 +196,8 @@ class CachedDecoder:
         def write_cache(layer: int) -> None:
             slots[layer].index_copy_(3, self._position, self._newest.unsqueeze(3))
 
-        x = self._embedded(self._tokens, self._positions.index_select(0, self._position), self._position)
+        places = None if self._around is None else self._around.places.index_select(0, self._position)[0]
+        x = self._embedded(self._tokens, self._positions.index_select(0, self._position), places)
         future = torch.arange(num_positions, device=self._device) > self._position
         logits = self._logits(x, self._cache[:, :, :, :num_positions], write_cache, future)
         chosen = self._sample_token(logits, self._uniform.index_select(1, self._position)[:, 0])

@@ -120,7 +120,8 @@ def observe(
     Returns:
         arrays of one value for each pixel of ``sensor.fine()``, or of ``sensor`` if ``kept_columns_only``.
     """
-    check_settings(seed, theme, max(frame, frames - 1), wet)
+    check_settings(seed, theme, frame, wet)
+    check_settings(seed, theme, frames - 1)
     sensor = sensor or load_sensor(_DEFAULT)
     # Children of a seed: 0 is the street's, and each frame has one.
     beam_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(frame + 1,)))
