@@ -9,13 +9,14 @@ import torch
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load
-from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
+from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
 from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import at_phases
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.nearest_range import NearestRangeConfig, NearestRangeTokenizer
 from lidargrit.nn.transformer import TransformerConfig
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, TokenGrid
@@ -169,6 +170,29 @@ def test_what_neighbours_suggest_is_weighed_by_the_probability_that_the_tokens_g
     walls = (of[1].centres.expm1() > 20)[..., own]
     share = [float((mixture.logits.softmax(-1)[..., own] * walls).sum(-1)[pole].mean()) for mixture in of]
     assert share[1] < 0.25 * share[0]
+
+
+def test_earlier_ranges_of_training_are_partly_the_decoders_own_samples_within_true_masks():
+    tokenizer, images = NearestRangeTokenizer(CONFIG, SENSOR).eval(), some_images(8)
+    pixels = PixelDecoder(replace(PIXELS, own_context=0.5), SENSOR, tokenizer.num_features, tokenizer.num_components)
+    with torch.no_grad():
+        decoded = tokenizer.decode(tokenizer.encode(images))
+    guide, rng = pixels.guide(decoded, 8), torch.Generator().manual_seed(0)
+    known_m = pixels._partly_own(guide, images, rng)
+    assert torch.equal(known_m > 0, images.return_mask)
+    own = (known_m != images.range_m).flatten(1).float().mean(1) > 0.5
+    assert own.tolist() == [True] * 4 + [False] * 4
+    uniform = torch.rand((8, 2, *images.range_m.shape[1:]), generator=rng.manual_seed(0))
+    nothing = Observed.nothing(SENSOR, 8)
+    with torch.no_grad():
+        sampled_m = pixels._sample_range(guide, uniform, images.return_mask, nothing, PixelSampling())
+    torch.testing.assert_close(known_m[:4], sampled_m[:4])
+    plain = PixelDecoder(PIXELS, SENSOR, tokenizer.num_features, tokenizer.num_components)
+    plain.load_state_dict(pixels.state_dict())
+    with torch.no_grad():
+        for training, alike in ((True, False), (False, True)):  # what validation tells is of true neighbours
+            nats = [each.train(training).estimate(decoded, images, rng.manual_seed(3))[1] for each in (pixels, plain)]
+            assert torch.equal(*nats) is alike
 
 
 def test_candidates_are_not_weighed_where_nothing_is_decoded_by_which_they_could_be():

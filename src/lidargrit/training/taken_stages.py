@@ -17,8 +17,8 @@ from lidargrit.generation.settings import Preset
 from lidargrit.training.checkpoint import load_average
 
 _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
-_NOT_LEARNED = (  # of sampling, and of another stage
-    *("range_temperature", "coarse_range_temperature"),
+_NOT_LEARNED = (  # of sampling, of training, and of another stage
+    *("range_temperature", "coarse_range_temperature", "own_context"),
     *("distilled_steps", "distilled_pairs"),
 )
 

@@ -184,12 +184,13 @@ class PixelDecoder(RayNetwork):
         """
         pixels, images = images.range_m.numel(), self._whole(images)
         guide = self.guide(decoded, len(images))
+        known_m = self._partly_own(guide, images, rng) if self.training and self.config.own_context else images.range_m
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
         returns, rng = guide.v.new_zeros(()), of_host(rng)
         for phases in self.mask.by_lattice():
             chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
-            of_mask, of_range = self._nll(chosen, guided, guide, images)
+            of_mask, of_range = self._nll(chosen, guided, guide, images, known_m=known_m)
             share = len(phases) / len(chosen)
             mask_nats = mask_nats + share * of_mask.sum()
             range_nats = range_nats + share * of_range.sum()
@@ -208,9 +209,16 @@ class PixelDecoder(RayNetwork):
         return self.mask.flops() + self.range.flops()
 
     def _nll(
-        self, phases: list[Phase], guided: _Guided, guide: Guide, images: RangeImage, steps: RangeSteps | None = None
+        self,
+        phases: list[Phase],
+        guided: _Guided,
+        guide: Guide,
+        images: RangeImage,
+        steps: RangeSteps | None = None,
+        known_m: Float[Tensor, "B H W"] | None = None,
     ) -> tuple[Float[Tensor, "P B h w"], Float[Tensor, "P B h w"]]:
-        mask, v = images.return_mask, images.range_m.log1p()
+        """Return the nats of mask and range, given the ranges of the scans, or others in their place."""
+        mask, v = images.return_mask, (images.range_m if known_m is None else known_m).log1p()
         returned = at_phases(mask, phases)
         of_mask = self.mask.phase_nll(phases, guided[0], guide, mask)
         # Where nothing returned, any range within the limits stands in: its likelihood is not used.
@@ -221,6 +229,19 @@ class PixelDecoder(RayNetwork):
         else:
             likelihood = mixture.log_mass(*steps.edges_m(steps.indices(range_m))).float()
         return of_mask, torch.where(returned, -likelihood, 0.0)
+
+    @torch.no_grad()
+    def _partly_own(self, guide: Guide, images: RangeImage, rng: torch.Generator) -> Float[Tensor, "B H W"]:
+        """Return the ranges of scans, those of a random share of them sampled within the true masks."""
+        device, size = guide.v.device, (len(images), 2, *guide.v.shape[1:])
+        uniform = torch.rand(size, generator=rng, device=rng.device).to(device)
+        chance = torch.rand((), generator=of_host(rng), device="cpu")
+        count = int(len(images) * self.config.own_context + float(chance))
+        if not count:
+            return images.range_m
+        condition = self.padded_condition(Observed.nothing(self.sensor, count, device))
+        own = guide.part(slice(0, count)), uniform[:count], images.return_mask[:count]
+        return torch.cat((self._sample_range(*own, condition, PixelSampling()), images.range_m[count:]))
 
     def sample(
         self,

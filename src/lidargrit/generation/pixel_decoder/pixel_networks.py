@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.typed_values import Bounds, Count, NotNegative
+from lidargrit.core.typed_values import Bounds, Count, NotNegative, Share
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
@@ -68,8 +68,9 @@ class PixelDecoderConfig(Settings):
         decoded_components: whether more components are those of the range's distribution that the tokenizer decodes,
             or one at its decoded range where it decodes no distribution; they are corrected as the mask's logits are.
         weighed_components: whether all other components are weighed by the probability that the decoded distribution
-            gives to ranges near them, so that a wall does not take the pixels of a pole of which the tokens tell; needs
-            ``decoded_components``.
+            gives to ranges near them, so that a wall does not take pixels of a pole; needs ``decoded_components``.
+        own_context: share of the scans of training whose earlier ranges the decoder samples itself; beside true ones
+            alone it learns to rely on neighbours more than on the tokens, and samples drift. It doubles the time.
         any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
             are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
             largest, and smaller images begin with smaller cells.
@@ -91,6 +92,7 @@ class PixelDecoderConfig(Settings):
     gravity_components: bool = False
     decoded_components: bool = False
     weighed_components: bool = False
+    own_context: Share = 0.0
     any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
 
@@ -98,8 +100,7 @@ class PixelDecoderConfig(Settings):
         super().__post_init__()
         phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
         if self.weighed_components and not self.decoded_components:
-            got = "weighed_components without decoded_components"
-            raise ConfigError(got, "both, or neither", "set decoded_components=true")
+            raise ConfigError("weighed_components without decoded_components", "both, or neither", "set both")
         if self.any_sensor and (self.column_halvings or self.row_halvings):
             got = f"any_sensor with column_halvings={self.column_halvings} and row_halvings={self.row_halvings}"
             raise ConfigError(got, "square cells, which all sensors share", "leave them out, or any_sensor")

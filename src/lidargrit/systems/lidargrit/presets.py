@@ -220,6 +220,7 @@ PRESETS = {
                 coarse_range_width=48,
                 decoded_components=True,
                 weighed_components=True,
+                own_context=0.5,
                 range_temperature=0.2,
             ),
         ),
