@@ -100,7 +100,7 @@ class PixelDecoderConfig(Settings):
         super().__post_init__()
         phases_of(self.coarsest_cell, self.column_halvings, self.row_halvings)
         if self.weighed_components and not self.decoded_components:
-            raise ConfigError("weighed_components without decoded_components", "both, or neither", "set both")
+            raise ConfigError("weighed_components without decoded_components", "both", "set decoded_components=true")
         if self.any_sensor and (self.column_halvings or self.row_halvings):
             got = f"any_sensor with column_halvings={self.column_halvings} and row_halvings={self.row_halvings}"
             raise ConfigError(got, "square cells, which all sensors share", "leave them out, or any_sensor")

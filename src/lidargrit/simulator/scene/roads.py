@@ -39,7 +39,12 @@ class GroundLook:
 
 @dataclass(frozen=True)
 class PaintLook:
-    """What markings look like along a road: every how manieth dash is painted, 0 for none, and their albedo."""
+    """What stays the same of markings along a road.
+
+    Args:
+        every: 1 if all dashes are painted, 2 for every second one; 0 for none.
+        bright: albedo of all markings.
+    """
 
     every: int
     bright: float
