@@ -166,7 +166,7 @@ def main() -> None:
         from dataclasses import replace  # noqa: PLC0415
 
         for batch, length, width in ((1, 256, 256), (16, 256, 256), (256, 256, 256), (1, 256, 512), (1, 512, 256)):
-            other = CausalTransformer(replace(transformer.config, width=width), 1024, length).eval()
+            other = CausalTransformer(replace(transformer.config, width=width), 1024, (1, length)).eval()
             print(f"length {length}, width {width}:")
             compare_tokens(other, batch, rates, beside=False)
 

@@ -130,7 +130,7 @@ class PartTransformer(CausalTransformer):
 
     def __init__(self, part: Part, num_tokens: int, grid: tuple[int, int]) -> None:
         sizes = TransformerConfig(**_SIZE, embedding_dropout=part.dropout, residual_dropout=part.dropout)
-        super().__init__(sizes, num_tokens, grid[0] * grid[1])
+        super().__init__(sizes, num_tokens, grid)
         self.part, self.grid = part, grid
         self.pos_emb.requires_grad_(part.positions != "rotary")  # they begin as 0, and so have no effect
         if part.qk_norm or part.positions != "learned":

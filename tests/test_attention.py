@@ -63,7 +63,7 @@ def test_32_bits_and_long_sequences_take_the_fused_kernel():
 def test_a_transformer_keeps_16_bits_under_autocast(monkeypatch):
     torch.manual_seed(0)
     transformer = CausalTransformer(
-        TransformerConfig(layers=2, heads=4, width=32), num_tokens=20, context_length=200
+        TransformerConfig(layers=2, heads=4, width=32), num_tokens=20, grid_size=(1, 200)
     ).eval()
     torch.nn.init.normal_(transformer.head.weight, std=0.5)
     tokens = torch.randint(20, (2, 200))

@@ -121,8 +121,8 @@ def test_a_masked_transformer_sees_both_sides_and_a_causal_one_does_not():
     tokens = torch.randint(8, (1, 10), generator=rng)
     changed = tokens.clone()
     changed[0, 9] = (changed[0, 9] + 1) % 8
-    for kind, sees in ((MaskedTransformer, True), (CausalTransformer, False)):
-        network = kind(config, 8, 10).eval()
+    for network, sees in ((MaskedTransformer(config, 8, 10), True), (CausalTransformer(config, 8, (1, 10)), False)):
+        network.eval()
         with torch.no_grad():
             assert torch.equal(network(tokens)[0, 0], network(changed)[0, 0]) != sees
 

@@ -48,7 +48,7 @@ def test_only_weights_of_linear_layers_decay():
 
 def small_transformer():
     torch.manual_seed(0)
-    return CausalTransformer(TransformerConfig(layers=2, heads=2, width=8), num_tokens=5, context_length=4)
+    return CausalTransformer(TransformerConfig(layers=2, heads=2, width=8), num_tokens=5, grid_size=(1, 4))
 
 
 class Wrapped(Objective):

@@ -48,7 +48,7 @@ def test_a_program_that_has_loaded_torch_keeps_its_environment():
 def test_small_steps_are_not_shared_by_threads_that_spin(policy, width, expected, monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     config = TransformerConfig(layers=1, heads=2, width=width)
-    transformer = CausalTransformer(config, num_tokens=8, context_length=2).eval()
+    transformer = CausalTransformer(config, num_tokens=8, grid_size=(1, 2)).eval()
     seen = []
 
     def sample_token(logits, uniform):

@@ -19,7 +19,7 @@ GREEDY = TokenSampling(temperature=0.0)
 @pytest.fixture
 def transformer():
     torch.manual_seed(0)
-    small = CausalTransformer(TransformerConfig(layers=2, heads=4, width=32), num_tokens=20, context_length=24).eval()
+    small = CausalTransformer(TransformerConfig(layers=2, heads=4, width=32), num_tokens=20, grid_size=(1, 24)).eval()
     torch.nn.init.normal_(small.head.weight, std=0.5)  # far from uniform, so that a mistake shows
     torch.nn.init.normal_(small.pos_emb, std=0.5)
     return small
@@ -29,7 +29,7 @@ def transformer():
 def golden_transformer(golden):
     data = golden("gpt_small")
     config = TransformerConfig(layers=2, heads=4, width=32)
-    model = CausalTransformer(config, num_tokens=32, context_length=64).eval()
+    model = CausalTransformer(config, num_tokens=32, grid_size=(1, 64)).eval()
     model.load_state_dict(seeded_weights(data))  # strict: the layout is the program's
     return model, data
 
@@ -129,7 +129,7 @@ def tokens_around_by_loop(transformer, read, columns):
 def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_them(static):
     torch.manual_seed(0)
     config = TransformerConfig(layers=2, heads=2, width=16, embedding_dropout=0.0, neighbours=True)
-    transformer = CausalTransformer(config, num_tokens=20, context_length=24, columns=6).eval()
+    transformer = CausalTransformer(config, num_tokens=20, grid_size=(4, 6)).eval()
     torch.nn.init.normal_(transformer.tok_emb.weight, std=0.5)
     torch.nn.init.normal_(transformer.head.weight, std=0.5)
     uniform = torch.rand((3, 24), generator=torch.Generator().manual_seed(1))
@@ -152,7 +152,7 @@ def test_guidance_moves_logits_away_from_those_without_the_attention_of_the_last
 ):
     torch.manual_seed(layers)
     config = TransformerConfig(layers=layers, heads=2, width=16)
-    transformer = CausalTransformer(config, num_tokens=20, context_length=24).eval()
+    transformer = CausalTransformer(config, num_tokens=20, grid_size=(1, 24)).eval()
     for parameter in transformer.parameters():  # at first biases are zero
         torch.nn.init.normal_(parameter, std=0.5)
     uniform = torch.rand((4, 24), generator=torch.Generator().manual_seed(1))
@@ -210,7 +210,7 @@ def test_generated_tokens_are_those_of_recomputing_in_any_batch_and_by_static_sh
 @pytest.mark.parametrize("static", [False, True])
 def test_a_decoder_may_generate_again_and_further_than_one_recording(static):
     torch.manual_seed(0)
-    longer = CausalTransformer(TransformerConfig(layers=1, heads=2, width=16), num_tokens=8, context_length=140).eval()
+    longer = CausalTransformer(TransformerConfig(layers=1, heads=2, width=16), num_tokens=8, grid_size=(1, 140)).eval()
     torch.nn.init.normal_(longer.pos_emb)
     decoder = CachedDecoder(longer, 2, partial(sample_token, sampling=TokenSampling()), static=static)
     one, other = torch.rand((2, 2, 140), generator=torch.Generator().manual_seed(0))

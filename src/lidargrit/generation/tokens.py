@@ -240,7 +240,7 @@ class TokenObjective(Objective):
 
     def __init__(self, tokenizer: Tokenizer, transformer: Transformer) -> None:
         super().__init__(tokenizer.sensor)
-        self.transformer, self._grid_size = transformer, tokenizer.grid_size
+        self.transformer, self.grid_size = transformer, tokenizer.grid_size
         self._tokens = EncodingCache(tokenizer, _tokens)
         self.register_buffer("token_counts", torch.ones(transformer.num_tokens))
 
@@ -248,10 +248,16 @@ class TokenObjective(Objective):
         """Return the weights of a trained transformer, with its positions resampled to this one's columns of tokens."""
         weights = super().weights_from(trained)
         if isinstance(trained, TokenObjective):
-            ours, theirs = self._grid_size, trained._grid_size
+            ours, theirs = self.grid_size, trained.grid_size
             if ours[0] == theirs[0] and ours != theirs:
-                name = "transformer.pos_emb"
-                weights[name] = resample_positions(weights[name], theirs, ours[1])
+                name, rows = "transformer.pos_emb", ours[0]
+                if "transformer.column_emb" in weights:  # positions in a window stay as they are
+                    name, rows = "transformer.column_emb", 1
+                size = weights[name].shape[-1]
+                old = weights[name].view(1, -1, size)
+                weights[name] = resample_positions(old, (rows, theirs[1]), ours[1]).view(
+                    *weights[name].shape[:-2], -1, size
+                )
         return weights
 
     @torch.no_grad()

@@ -50,7 +50,7 @@ _POSITIONS_PER_GRAPH = 128  # with static shapes, attention reads a multiple of 
 
 
 class CachedDecoder:
-    """Generates sequences of the transformer's longest length, ``batch_size`` at once, from one set of weights.
+    """Generates the tokens of whole scans, ``batch_size`` at once, from one set of weights.
 
     Args:
         transformer: transformer in evaluation mode; later changes of its weights may have no effect here.
@@ -83,8 +83,9 @@ class CachedDecoder:
         self._static = self._device.type == "cuda" if static is None else static
         dtype = torch.float32 if precision == "fp32" else torch.bfloat16
         heads, width = transformer.config.heads, transformer.config.width
+        self._windows, self._positions_of = transformer.windows, transformer.positions
         self._embedding = transformer.tok_emb.weight.detach().to(dtype)
-        self._positions = transformer.pos_emb[0].detach().to(dtype)
+        self._positions = transformer.positions().detach().to(dtype, copy=True)
         self._around = transformer.around
         tables = None if self._around is None else self._around.tables(transformer.tok_emb.weight).detach()
         self._tables = torch.empty(0) if tables is None else tables.to(dtype)
@@ -112,28 +113,65 @@ class CachedDecoder:
     @torch.inference_mode(False)  # its tensors are written to in later calls, which may be outside of it
     @torch.no_grad()
     def generate(self, uniform: Float[Tensor, "B T"], observed: Int[Tensor, "B T"] | None = None) -> Int[Tensor, "B T"]:
-        """Generate one sequence for each row of uniform numbers in [0, 1), one number a token.
+        """Generate the tokens of one scan, row by row, for each row of uniform numbers in [0, 1), one number a token.
 
         Args:
             uniform: one random number for each token.
             observed: tokens that stand already, and -1 where one is to be generated; later tokens know of them.
         """
-        length = uniform.shape[1]
         observed = torch.full_like(uniform, -1, dtype=torch.long) if observed is None else observed
+        if self._windows is None:
+            return self._sequence(uniform, observed)
+        chances, found = (each.unflatten(1, self._windows.grid_size) for each in (uniform, observed.clone()))
+        for columns, known in self._windows.in_turn():
+            self._positions.copy_(self._positions_of(columns))
+            inputs = (self._windows.take(each, columns) for each in (chances, found))
+            tokens = self._sequence(*inputs, known=known * self._windows.grid_size[0])
+            found[:, :, columns] = tokens.unflatten(1, (len(columns), -1)).transpose(1, 2)
+        return found.flatten(1)
+
+    def _sequence(
+        self, uniform: Float[Tensor, "B T"], observed: Int[Tensor, "B T"], known: int = 0
+    ) -> Int[Tensor, "B T"]:
+        """Generate one sequence; of the first ``known`` tokens, which are all observed, the cache is filled at once."""
+        length = uniform.shape[1]
         if self._static:
             self._record_graphs(length)
             self._uniform[:, :length], self._observed[:, :length] = uniform, observed
-            self._rewind()
-            for step in range(length):
+            self._begin(observed[:, :known])
+            for step in range(known, length):
                 self._graphs[step // _POSITIONS_PER_GRAPH]()
         else:
-            self._tokens.fill_(self._start)
             with threads_for(self._step_flops):
-                for step in range(length):
+                self._begin(observed[:, :known])
+                for step in range(known, length):
                     chosen = self._sample_token(self.next_logits(self._tokens, step), uniform[:, step])
                     self._tokens = torch.where(observed[:, step] < 0, chosen, observed[:, step])
                 self._generated[:, length - 1] = self._tokens
         return self._generated[:, :length].clone()
+
+    def _begin(self, known: Int[Tensor, "B N"]) -> None:
+        """Go to the position after the first tokens, whose keys and values are written into the cache at once."""
+        count = known.shape[1]
+        self._position.fill_(count)
+        if not count:
+            self._tokens.fill_(self._start)
+            return
+        self._generated[:, :count] = known
+        self._tokens.copy_(known[:, -1])
+        read = F.pad(known[:, :-1], (1, 0), value=self._start)
+        x = F.embedding(read, self._embedding) + self._positions[:count]
+        if self._around is not None:
+            x = x + self._around(read, self._tables)
+
+        def attended(layer: int, block: _Block, x: Tensor) -> Tensor:
+            parts = block.query_key_value(block.norm1(x), None).unflatten(0, (-1, count))
+            query, key, value = parts.unflatten(-1, (3, self._query.shape[1], -1)).permute(2, 0, 3, 1, 4)
+            self._slots[layer, :, :, :, :count] = torch.stack((key, value))
+            mixed = F.scaled_dot_product_attention(query, key, value, is_causal=True, scale=1.0)
+            return mixed.transpose(1, 2).flatten(2).flatten(0, 1)
+
+        self._through_blocks(x.flatten(0, 1), attended)
 
     @torch.no_grad()
     def next_logits(self, tokens: Int[Tensor, "B"], position: int) -> Float[Tensor, "B K"]:
@@ -167,24 +205,36 @@ class CachedDecoder:
     ) -> Tensor:
         keys, values = (each.unbind() for each in past.unflatten(2, self._query.shape[:2]).unbind(1))
 
-        def add_attention(layer: int, block: _Block, x: Tensor) -> None:
+        def attended(layer: int, block: _Block, x: Tensor) -> Tensor:
             block.query_key_value(block.norm1(x), self._fused)
             write_cache(layer)
-            x.add_(block.proj(_attend(self._query, keys[layer], values[layer], future).view_as(x), None))
+            return _attend(self._query, keys[layer], values[layer], future).view_as(x)
 
+        x, weaker = self._through_blocks(x, attended)
+        if not self._weaker:
+            return self._head_logits(x)
+        return torch.lerp(self._head_logits(weaker), self._head_logits(x), self._guidance)
+
+    def _through_blocks(
+        self, x: Float[Tensor, "N C"], attended: "Callable[[int, _Block, Tensor], Tensor]"
+    ) -> tuple[Float[Tensor, "N C"], Float[Tensor, "N C"]]:
+        """Return the output of all blocks, and of the weaker transformer's, if there is one.
+
+        Args:
+            attended: returns what a block's attention finds; it writes keys and values into the cache of a layer.
+        """
         weaker = x
         for layer, block in enumerate(self._blocks):
             if layer == len(self._blocks) - len(self._weaker):
                 weaker = x.clone()
-            add_attention(layer, block, x)
+            x.add_(block.proj(attended(layer, block, x), None))
             block.add_perceptron(x)
-        if not self._weaker:
-            return self._head_logits(x)
-        self._weaker[0].add_perceptron(weaker)
+        if self._weaker:
+            self._weaker[0].add_perceptron(weaker)
         for layer, block in enumerate(self._weaker[1:], start=len(self._blocks)):
-            add_attention(layer, block, weaker)
+            weaker.add_(block.proj(attended(layer, block, weaker), None))
             block.add_perceptron(weaker)
-        return torch.lerp(self._head_logits(weaker), self._head_logits(x), self._guidance)
+        return x, weaker
 
     def _head_logits(self, x: Tensor) -> Tensor:
         return F.linear(self._last_norm(x), self._head).float()
@@ -207,10 +257,6 @@ class CachedDecoder:
         self._generated.index_copy_(1, self._position, chosen[:, None])
         self._position.add_(1)
 
-    def _rewind(self) -> None:
-        self._tokens.fill_(self._start)
-        self._position.zero_()
-
     def _record_graphs(self, length: int) -> None:
         for index in range(len(self._graphs), math.ceil(length / _POSITIONS_PER_GRAPH)):
             num_positions = min((index + 1) * _POSITIONS_PER_GRAPH, self._length)
@@ -220,10 +266,10 @@ class CachedDecoder:
             stream, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):  # once outside of the graph, so that libraries take their workspaces
-                self._rewind()
+                self._begin(self._observed[:, :0])
                 self._static_step(num_positions)
             torch.cuda.current_stream().wait_stream(stream)
-            self._rewind()
+            self._begin(self._observed[:, :0])
             with torch.cuda.graph(graph):
                 self._static_step(num_positions)
             self._graphs[index] = graph.replay

@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.typed_values import Bounds, Count, ShareBelow1
+from lidargrit.core.typed_values import Bounds, Count, NotNegative, ShareBelow1
 from lidargrit.nn.blocks import Block, Network
 from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.windows import Windows
 
 _QUERIES_AT_ONCE = 128  # their scores with all keys stay in a processor's cache
 _KEYS_AT_MOST = 1024  # beyond, scores no longer fit the cache, and the memory for their gradients grows as the square
@@ -70,6 +71,9 @@ class TransformerConfig(Settings):
         residual_dropout: probability of dropout on the output of each block's two branches.
         neighbours: whether a position also reads the tokens around it in the grid that come before it, where the paper
             gives it the previous token alone and leaves it to attention to learn where the row above lies.
+        window_columns: number of columns of tokens that are read at once, column by column, as the sensor turns; half
+            of them go on from earlier ones. 0 reads whole scans, row by row, as in the paper. A training reads one
+            window of each scan.
     """
 
     layers: Annotated[int, Bounds(1, _LAYERS_AT_MOST)] = 6
@@ -78,6 +82,7 @@ class TransformerConfig(Settings):
     embedding_dropout: ShareBelow1 = 0.2
     residual_dropout: ShareBelow1 = 0.0
     neighbours: bool = False
+    window_columns: NotNegative = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,25 +119,26 @@ class Transformer(Network):
 
     def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
         """Return the logits at each position: of the next token if causal, else of the position's own."""
-        x = self.drop(self.embedded(tokens))
+        return self._logits(self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]])
+
+    def _logits(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T K"]:
+        x = self.drop(x)
         for block in self.blocks:
             x = block(x)
         return self.head(self.ln_f(x))
-
-    def embedded(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T C"]:
-        """Return what the blocks read."""
-        return self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]]
 
 
 class TokensAround(nn.Module):
     """What the tokens around a position add to its embedding, each by a linear map of its own.
 
-    They are those of the grid up to three rows above and three columns to the left; columns wrap around. The next token
-    depends on these most, and a short training finds that sooner than by attention over learned positions.
+    They are those of the grid up to three rows above and three columns to the left. The next token depends on these
+    most, and a short training finds that sooner than by attention over learned positions.
 
     Args:
-        grid_size: rows and columns of the grid, whose tokens come row by row.
+        grid_size: rows and columns of the grid, whose tokens come row by row. In a window, whose tokens come column by
+            column, these are its columns and rows.
         width: length of the vector that stands for a token.
+        wraps: whether the last column lies beside the first.
 
     Source:
         van den Oord et al., Pixel Recurrent Neural Networks, 2016, for the neighbours that come before a pixel.
@@ -140,13 +146,14 @@ class TokensAround(nn.Module):
 
     places: Tensor
 
-    def __init__(self, grid_size: tuple[int, int], width: int) -> None:
+    def __init__(self, grid_size: tuple[int, int], width: int, wraps: bool) -> None:
         super().__init__()
         self.maps = nn.Parameter(torch.randn(len(_AROUND), width, width) * width**-0.5)
         # Of each position, the places of its neighbours in a sequence that begins with the start token.
         row, column = torch.arange(grid_size[0])[:, None, None], torch.arange(grid_size[1])[:, None]
         down, right = torch.tensor(_AROUND).unbind(1)
-        absent = (row + down < 0) | ((down == 0) & (column + right < 0))
+        beyond = (column + right < 0) | (column + right >= grid_size[1])
+        absent = (row + down < 0) | (beyond & ((down == 0) | (not wraps)))
         place = (row + down) * grid_size[1] + (column + right) % grid_size[1] + 1
         places = torch.where(absent, math.prod(grid_size), place).flatten(0, 1)
         self.register_buffer("places", places, persistent=False)
@@ -172,27 +179,58 @@ class CausalTransformer(Transformer):
     """Predicts, at every position of a sequence, the token that follows.
 
     Args:
-        columns: columns of the grid whose tokens the sequence is, row by row; 0 for a sequence of one row.
+        num_tokens: number of different tokens.
+        grid_size: rows and columns of the grid whose tokens it predicts: one sequence row by row, or windows of it
+            column by column (``config.window_columns``).
+
+    Attributes:
+        windows: the windows over the grid; None where the grid is one sequence.
     """
 
-    def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int, columns: int = 0) -> None:
-        super().__init__(config, num_tokens, num_tokens, context_length, causal=True)
-        grid_size = (context_length // columns, columns) if columns else (1, context_length)
-        self.around = TokensAround(grid_size, config.width) if config.neighbours else None
+    def __init__(self, config: TransformerConfig, num_tokens: int, grid_size: tuple[int, int]) -> None:
+        rows, columns = grid_size
+        windows = Windows(grid_size, config.window_columns) if config.window_columns else None
+        length = rows * columns if windows is None else windows.length
+        super().__init__(config, num_tokens, num_tokens, length, causal=True)
+        self.windows, self.column_emb, self.around = windows, None, None
+        if windows is not None:
+            self.column_emb = nn.Parameter(torch.zeros(columns, config.width))
+        if config.neighbours:
+            in_order = grid_size if windows is None else (windows.columns, rows)
+            self.around = TokensAround(in_order, config.width, wraps=windows is None)
 
-    def embedded(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T C"]:
+    def forward(self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "B T K"]:
+        """Return the logits of the next token at each position.
+
+        Args:
+            tokens: sequences that begin with the start token.
+            columns: numbers in the grid of the columns of windows; None where the grid is one sequence.
+        """
+        return self._logits(self.embedded(tokens, columns))
+
+    def embedded(
+        self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
+    ) -> Float[Tensor, "B T C"]:
         """Return what the blocks read."""
-        x = super().embedded(tokens)
+        x = self.tok_emb(tokens) + self.positions(columns)[..., : tokens.shape[1], :]
         return x if self.around is None else x + self.around(tokens, self.around.tables(self.tok_emb.weight))
+
+    def positions(self, columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "*B T C"]:
+        """Return what is learned of each position of a sequence, or of windows at these columns of the grid."""
+        if self.windows is None or self.column_emb is None or columns is None:
+            return self.pos_emb[0]
+        of_columns = self.column_emb[columns.to(self.column_emb.device)]
+        return self.pos_emb[0] + of_columns.repeat_interleave(self.windows.grid_size[0], -2)
 
 
 class MaskedTransformer(Transformer):
     """Predicts the tokens of a sequence that are hidden, which it reads as ``mask_token``."""
 
     def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
-        if config.neighbours:
-            cure = "leave it out, or take a generator of tokens one by one"
-            raise ConfigError("model.transformer.neighbours=true of masked tokens", "false", cure)
+        for setting in ("neighbours", "window_columns"):
+            if getattr(config, setting):
+                cure = "leave it out, or take a generator of tokens one by one"
+                raise ConfigError(f"model.transformer.{setting} of masked tokens", "its default", cure)
         super().__init__(config, num_tokens + 1, num_tokens, context_length, causal=False)
         self.mask_token = num_tokens
 

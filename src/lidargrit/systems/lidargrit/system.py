@@ -26,7 +26,7 @@ from lidargrit.generation.tokens import (
 )
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
 from lidargrit.nn.published import read_checkpoint
-from lidargrit.nn.random import rngs_of, sample_index
+from lidargrit.nn.random import of_host, rngs_of, sample_index
 from lidargrit.nn.transformer import CausalTransformer
 from lidargrit.scans.condition import Condition, ConditionKind, Observed
 from lidargrit.scans.example import Example
@@ -101,9 +101,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        height, width = self.tokenizer.grid_size
-        sizes = config.transformer, self.tokenizer.num_codes, height * width
-        self.transformer = CausalTransformer(*sizes, columns=width)
+        self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, self.tokenizer.grid_size)
         self._decoder_cache: _DecoderCache | None = None
         self._one_at_a_time = threading.Lock()
 
@@ -127,14 +125,14 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
     ) -> RangeImage:
         """Generate the tokens without any observed pixel, and with a pixel decoder the pixels around observed ones.
 
-        Tokens come row by row, and pixels in phases. Each is conditioned on the observed ones before it, not on later
-        ones.
+        Tokens come row by row, or in windows column by column, and pixels in phases. Each is conditioned on the
+        observed ones before it, not on later ones.
 
         Args:
             count: number of scans to return.
         """
         self.check_choice(sampling.mask, sampling.pixels())
-        uniform = torch.stack([torch.rand(self.transformer.context_length, generator=rng) for rng in rngs])
+        uniform = torch.stack([torch.rand(math.prod(self.tokenizer.grid_size), generator=rng) for rng in rngs])
         tokens = None if condition is None else self.observed_tokens(condition)
         with self._one_at_a_time:  # threads would write into one cache
             decoder, tokenizer = self._prepare(len(rngs), sampling)
@@ -144,19 +142,17 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
         """Return the bits of each token given those before it."""
-        tokens = grid.tokens.flatten(1)
-        logits = self.transformer(after_start(tokens[:, :-1]))
-        nats = F.cross_entropy(logits.double().movedim(-1, 1), tokens, reduction="none")
-        return (nats / math.log(2)).float().view(grid.tokens.shape)
+        return (nats_of_tokens(self.transformer, grid.tokens) / math.log(2)).float()
 
     def cost(self, sampling: TokenSampling | None = None) -> Cost:
         """Return the cost of one step of the transformer for each token, with a cache, and of one decoding."""
-        tokens = self.transformer.context_length
         sampling = sampling or TokenSampling()
-        guidance = self._guidance(sampling)
-        flops = sum(flops_of_step(self.transformer, position, guidance) for position in range(tokens))
+        guidance, windows = self._guidance(sampling), self.transformer.windows
+        sequences = 1 if windows is None else len(windows.in_turn())  # those of windows are read from their beginning
+        of_one = sum(flops_of_step(self.transformer, at, guidance) for at in range(self.transformer.context_length))
         decoding = self.decoding_cost(sampling.mask)
-        return Cost(tokens + decoding.network_evaluations, flops + decoding.flops)
+        evaluations = math.prod(self.tokenizer.grid_size) + sequences - 1 + decoding.network_evaluations
+        return Cost(evaluations, sequences * of_one + decoding.flops)
 
     def _guidance(self, sampling: TokenSampling) -> float:
         return sampling.guidance or self.config.guidance
@@ -227,12 +223,40 @@ class _DecoderCache(NamedTuple):
 class NextToken(TokenObjective):
     """The transformer's objective: negative log-likelihood of each token after those before it, in nats per token."""
 
+    transformer: CausalTransformer
+
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
-        """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur."""
+        """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur.
+
+        In training over windows, it is that of one window of each scan.
+        """
         tokens, unigram_nll = self.encode(example)
-        logits = self.transformer(after_start(tokens[:, :-1]))
-        loss = F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten())
+        grid, windows = tokens.unflatten(1, self.grid_size), self.transformer.windows
+        if self.training and windows is not None:
+            columns, counts = windows.draw(len(tokens), of_host(rng))
+            counts = counts.to(tokens.device).repeat_interleave(windows.grid_size[0], 1)
+            loss = (_nats(self.transformer, windows.take(grid, columns), columns) * counts).sum() / counts.sum()
+        else:
+            loss = nats_of_tokens(self.transformer, grid).mean()
         return {"loss": loss, "unigram_nll": unigram_nll.mean()}
+
+
+def nats_of_tokens(transformer: CausalTransformer, grid: Int[Tensor, "B h w"]) -> Float[Tensor, "B h w"]:
+    """Return the nats of each token given those before it."""
+    if transformer.windows is None:
+        return _nats(transformer, grid.flatten(1)).view(grid.shape)
+    found = grid.new_zeros(grid.shape, dtype=torch.float32)
+    for columns, known in transformer.windows.in_turn():
+        nats = _nats(transformer, transformer.windows.take(grid, columns), columns)
+        found[:, :, columns[known:]] = nats.unflatten(1, (len(columns), -1)).transpose(1, 2)[:, :, known:]
+    return found
+
+
+def _nats(
+    transformer: CausalTransformer, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
+) -> Float[Tensor, "B T"]:
+    logits = transformer(after_start(tokens[:, :-1]), columns)
+    return F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten(), reduction="none").view_as(tokens)
 
 
 def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:

@@ -1,0 +1,94 @@
+"""Windows of columns of a token grid: what a transformer reads at once, where whole scans are too long for it."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Int, Shaped
+from torch import Tensor
+
+from lidargrit.core.errors import ConfigError
+
+_LEAST = 8  # columns of a window, of which one column in so many is one of the grid's first
+_FIRST_SHARE = 0.2  # of the windows that are drawn, those that are the first: there alone nothing stands yet
+
+
+class Window(NamedTuple):
+    """One window.
+
+    Args:
+        columns: numbers of its columns in the grid.
+        known: how many of them, the first ones, earlier windows have.
+    """
+
+    columns: Int[Tensor, "W"]
+    known: int
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How windows go over a grid of tokens, column by column, as the sensor turns.
+
+    The first window is the grid's first columns. Every other begins with a few of these again, so that the scan's end
+    can meet its beginning, and goes on with columns of which earlier windows have the first half.
+
+    Args:
+        grid_size: rows and columns of the grid.
+        columns: number of columns of a window.
+    """
+
+    grid_size: tuple[int, int]
+    columns: int
+
+    def __post_init__(self) -> None:
+        if not _LEAST <= self.columns < self.grid_size[1]:
+            raise ConfigError(
+                f"model.transformer.window_columns={self.columns} for tokens in {self.grid_size[1]} columns",
+                f"from {_LEAST} to {self.grid_size[1] - 1}",
+                "change it, or leave it out: 0 reads whole scans",
+            )
+
+    @property
+    def length(self) -> int:
+        """Number of tokens in a window."""
+        return self.columns * self.grid_size[0]
+
+    @property
+    def first(self) -> int:
+        """Number of the grid's first columns with which each later window begins."""
+        return self.columns // _LEAST
+
+    def in_turn(self) -> list[Window]:
+        """Return the windows that together have every column, in the order in which they are sampled."""
+        found, done, own = [self.beginning()], self.columns, self.columns - self.first
+        while done < self.grid_size[1]:
+            start = min(done - own // 2, self.grid_size[1] - own)
+            found.append(Window(self._columns(start), self.first + done - start))
+            done = start + own
+        return found
+
+    def beginning(self) -> Window:
+        """Return the first window."""
+        return Window(torch.arange(self.columns), 0)
+
+    def draw(self, count: int, rng: torch.Generator) -> tuple[Int[Tensor, "B W"], Bool[Tensor, "B W"]]:
+        """Return the columns of random windows, and which of these a training is to learn.
+
+        Args:
+            count: number of windows.
+            rng: random numbers on the CPU.
+        """
+        last = self.grid_size[1] - (self.columns - self.first)
+        starts = torch.randint(self.first + 1, last + 1, (count,), generator=rng)
+        is_first = torch.rand(count, generator=rng) < _FIRST_SHARE
+        others = torch.stack([self._columns(int(start)) for start in starts])
+        columns = torch.where(is_first[:, None], torch.arange(self.columns), others)
+        return columns, is_first[:, None] | (torch.arange(self.columns) >= self.first)
+
+    def take(self, grid: Shaped[Tensor, "B h w"], columns: Int[Tensor, "*C W"]) -> Shaped[Tensor, "B T"]:
+        """Return what a grid has in windows, column by column."""
+        columns = columns.to(grid.device).expand(len(grid), -1)
+        return grid.gather(2, columns[:, None].expand(-1, grid.shape[1], -1)).transpose(1, 2).flatten(1)
+
+    def _columns(self, start: int) -> Int[Tensor, "W"]:
+        return torch.cat((torch.arange(self.first), torch.arange(start, start + self.columns - self.first)))
