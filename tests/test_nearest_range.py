@@ -32,6 +32,21 @@ PIXELS = PixelDecoderConfig(
 )
 
 
+def test_features_tell_codes_apart_and_those_of_near_levels_or_of_most_parts_in_common_are_alike():
+    tokenizer = NearestRangeTokenizer(replace(CONFIG, part_columns=2), SENSOR)
+    features = tokenizer.code_features()
+    assert features.shape[0] == tokenizer.num_codes == 1 + 128 * 15
+    assert len(features.unique(dim=0)) == tokenizer.num_codes
+    directions = features / features.norm(dim=1, keepdim=True)
+
+    def alike(one, other):
+        return float(directions[1 + 15 * one[0] + one[1] - 1] @ directions[1 + 15 * other[0] + other[1] - 1])
+
+    assert alike((40, 3), (41, 3)) > alike((40, 3), (44, 3)) > alike((40, 3), (90, 3))
+    assert alike((40, 0b0111), (40, 0b0011)) > alike((40, 0b0111), (40, 0b1000))
+    assert float((directions[1:] @ directions[0]).abs().max()) == 0  # an empty cell is like no other
+
+
 def tokens_by_loop(image, config):
     """Return the tokens of one image, cell by cell and part by part."""
     range_m, found = image.range_m.tolist(), []

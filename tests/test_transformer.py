@@ -8,12 +8,14 @@ import pytest
 import torch
 from scipy import stats
 
+from lidargrit.core.errors import ConfigError
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig, resample_positions
 from lidargrit.systems.lidargrit.system import START_TOKEN, TokenSampling, after_start, sample_token
 from reference_weights import seeded_weights
 
 GREEDY = TokenSampling(temperature=0.0)
+CODE_FEATURES = torch.randn((20, 5), generator=torch.Generator().manual_seed(3))
 
 
 @pytest.fixture
@@ -109,6 +111,16 @@ def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, toler
     assert float((whole - stepwise).abs().max()) < tolerance
 
 
+def embedding_by_loop(transformer):
+    """Return each code's own vector plus those of its features, one code and one feature at a time."""
+    vectors = transformer.tok_emb.weight.clone()
+    if transformer.shared is not None:
+        for code, features in enumerate(CODE_FEATURES):
+            for number, value in enumerate(features):
+                vectors[code] += 3 * value / features.norm() * transformer.shared.embedding[number]
+    return vectors
+
+
 def tokens_around_by_loop(transformer, read, columns):
     """Return what the tokens around add at each position, one position and one neighbour at a time."""
     length, added = read.shape[1], torch.zeros(*read.shape, transformer.config.width)
@@ -121,28 +133,55 @@ def tokens_around_by_loop(transformer, read, columns):
                 continue
             place = (row - up) * columns + (column - left) % columns
             token = read[:, place + 1]  # the first is the start token
-            added[:, position] += transformer.tok_emb.weight[token] @ transformer.around.maps[number]
+            added[:, position] += embedding_by_loop(transformer)[token] @ transformer.around.maps[number]
     return added
 
 
+@pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("static", [False, True])
-def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_them(static):
+def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_them(static, shared):
     torch.manual_seed(0)
-    config = TransformerConfig(layers=2, heads=2, width=16, embedding_dropout=0.0, neighbours=True)
-    transformer = CausalTransformer(config, num_tokens=20, grid_size=(4, 6)).eval()
+    config = TransformerConfig(
+        layers=2, heads=2, width=16, embedding_dropout=0.0, neighbours=True, code_features=shared
+    )
+    transformer = CausalTransformer(config, num_tokens=20, grid_size=(4, 6), code_features=CODE_FEATURES).eval()
     torch.nn.init.normal_(transformer.tok_emb.weight, std=0.5)
     torch.nn.init.normal_(transformer.head.weight, std=0.5)
+    if shared:
+        torch.nn.init.normal_(transformer.shared.head, std=0.5)
     uniform = torch.rand((3, 24), generator=torch.Generator().manual_seed(1))
     sampled = generate(transformer, uniform, TokenSampling(), static=static)
     with torch.no_grad():
         read = after_start(sampled[:, :-1])
-        plain = transformer.tok_emb(read) + transformer.pos_emb
+        plain = embedding_by_loop(transformer)[read] + transformer.pos_emb
         around = transformer.embedded(read) - plain
         assert torch.allclose(around, tokens_around_by_loop(transformer, read, 6), atol=1e-5)
         assert torch.allclose(transformer(read[:, :9]), transformer(read)[:, :9], atol=1e-5)  # of a shorter sequence
         logits = transformer(read)
     chosen = [sample_token(logits[:, i], uniform[:, i], TokenSampling()) for i in range(24)]
     assert torch.equal(torch.stack(chosen, 1), sampled)
+
+
+def test_codes_that_share_weights_learn_from_one_another():
+    """A step on one code moves the logits of those with alike features, too; without features of its own alone."""
+    for features, alike in ((torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.0, 1.0]]), True), (None, False)):
+        torch.manual_seed(0)
+        config = TransformerConfig(1, 2, 8, embedding_dropout=0.0, code_features=alike)
+        network = CausalTransformer(config, 3, (1, 2), features)
+        read = torch.zeros((1, 2), dtype=torch.long)
+        before = network(read)[0, -1].detach()
+        network(read)[0, -1].log_softmax(-1)[0].backward()
+        with torch.no_grad():
+            for weight in (network.head.weight, *(() if features is None else (network.shared.head,))):
+                weight += 0.1 * weight.grad
+        moved = (network(read)[0, -1] - before).detach()
+        assert moved[0] > 0
+        assert (moved[1] > 0.5 * moved[0]) == alike
+
+
+def test_features_of_codes_are_refused_of_a_tokenizer_that_has_none():
+    with pytest.raises(ConfigError, match="take the tokenizer nearest_range"):
+        CausalTransformer(TransformerConfig(1, 2, 8, code_features=True), 3, (1, 2))
 
 
 @pytest.mark.parametrize(("layers", "unattending"), [(1, 0), (2, 0), (4, 2)])

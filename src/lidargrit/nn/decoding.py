@@ -84,15 +84,16 @@ class CachedDecoder:
         dtype = torch.float32 if precision == "fp32" else torch.bfloat16
         heads, width = transformer.config.heads, transformer.config.width
         self._windows, self._positions_of = transformer.windows, transformer.positions
-        self._embedding = transformer.tok_emb.weight.detach().to(dtype)
+        embedding = transformer.embedding().detach()
+        self._embedding = embedding.to(dtype)
         self._positions = transformer.positions().detach().to(dtype, copy=True)
         self._around = transformer.around
-        tables = None if self._around is None else self._around.tables(transformer.tok_emb.weight).detach()
+        tables = None if self._around is None else self._around.tables(embedding).detach()
         self._tables = torch.empty(0) if tables is None else tables.to(dtype)
         self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
         self._guidance, self._weaker = guidance, self._blocks[-2:] if guidance != 1 else []
         self._last_norm = _norm(transformer.ln_f, dtype)
-        self._head = transformer.head.weight.detach().to(dtype)
+        self._head = transformer.head_weight().detach().to(dtype)
         # Layer, key or value, sequence and head, position, number: a step writes one position of all layers, the weaker
         # transformer's own last one behind those of all blocks.
         layers = len(self._blocks) + len(self._weaker[1:])
@@ -183,19 +184,20 @@ class CachedDecoder:
 
         if position:
             self._generated[:, position - 1] = tokens
-        places = None if self._around is None else self._around.places[position]
-        x = self._embedded(tokens, self._positions[position], places)
+        x = self._embedded(tokens, lambda of_positions: of_positions[position])
         return self._logits(x, self._cache[:, :, :, : position + 1], write_cache)
 
-    def _embedded(self, tokens: Tensor, own: Tensor, places: Tensor | None) -> Tensor:
+    def _embedded(self, tokens: Int[Tensor, "B"], at: Callable[[Tensor], Tensor]) -> Float[Tensor, "B C"]:
         """Return the sum of what the previous token, the position and the tokens around it are embedded as.
 
         Args:
-            places: places of the tokens around, counted from the start token; the last is none.
+            tokens: previous token of each sequence.
+            at: returns what a table over positions, its first axis, has at the present one.
         """
-        x = F.embedding(tokens, self._embedding) + own
-        if self._around is None or places is None:
+        x = F.embedding(tokens, self._embedding) + at(self._positions)
+        if self._around is None:
             return x
+        places = at(self._around.places)  # counted from the start token; the last is none
         around = F.pad(self._generated, (1, 0)).index_select(1, places)
         around = torch.where(places < self._length, around, -1)
         return x + self._around.added(around, self._tables)
@@ -246,8 +248,7 @@ class CachedDecoder:
         def write_cache(layer: int) -> None:
             slots[layer].index_copy_(3, self._position, self._newest.unsqueeze(3))
 
-        places = None if self._around is None else self._around.places.index_select(0, self._position)[0]
-        x = self._embedded(self._tokens, self._positions.index_select(0, self._position), places)
+        x = self._embedded(self._tokens, lambda of_positions: of_positions.index_select(0, self._position)[0])
         future = torch.arange(num_positions, device=self._device) > self._position
         logits = self._logits(x, self._cache[:, :, :, :num_positions], write_cache, future)
         chosen = self._sample_token(logits, self._uniform.index_select(1, self._position)[:, 0])

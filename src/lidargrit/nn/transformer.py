@@ -56,6 +56,8 @@ def attend(
 
 
 _AROUND = ((0, -2), (0, -3), *((-1, right) for right in range(-2, 3)), (-2, -1), (-2, 0), (-2, 1), (-3, 0))
+_FEATURES_LENGTH = 3.0  # of each code's: what codes share then moves more quickly than what each has of its own
+_AROUND_IF_SHARED = 0.3  # of the usual first weights of the tokens around, since shared embeddings begin longer
 _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
 
 
@@ -71,6 +73,8 @@ class TransformerConfig(Settings):
         residual_dropout: probability of dropout on the output of each block's two branches.
         neighbours: whether a position also reads the tokens around it in the grid that come before it, where the paper
             gives it the previous token alone and leaves it to attention to learn where the row above lies.
+        code_features: whether codes share weights by what they stand for, such as their range, so that a rare code is
+            learned from those like it. The tokenizer has to know what its codes stand for, as ``nearest_range`` does.
         window_columns: number of columns of tokens that are read at once, column by column, as the sensor turns; half
             of them go on from earlier ones. 0 reads whole scans, row by row, as in the paper. A training reads one
             window of each scan.
@@ -82,6 +86,7 @@ class TransformerConfig(Settings):
     embedding_dropout: ShareBelow1 = 0.2
     residual_dropout: ShareBelow1 = 0.0
     neighbours: bool = False
+    code_features: bool = False
     window_columns: NotNegative = 0
 
     def __post_init__(self) -> None:
@@ -99,13 +104,20 @@ class Transformer(Network):
         num_tokens: number of different tokens that it predicts.
         context_length: number of tokens in the longest sequence.
         causal: whether a token attends only to itself and to those before it.
+        code_features: features of every code, by which codes share weights; None where each has its own alone.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.3; layers as in hamedhaghighi/LidarGRIT@a3f86e7.
     """
 
     def __init__(
-        self, config: TransformerConfig, num_inputs: int, num_tokens: int, context_length: int, causal: bool
+        self,
+        config: TransformerConfig,
+        num_inputs: int,
+        num_tokens: int,
+        context_length: int,
+        causal: bool,
+        code_features: Float[Tensor, "K F"] | None = None,
     ) -> None:
         super().__init__()
         self.config, self.num_tokens, self.context_length = config, num_tokens, context_length
@@ -115,17 +127,46 @@ class Transformer(Network):
         self.blocks = nn.ModuleList(TransformerBlock(config, causal) for _ in range(config.layers))
         self.ln_f = nn.LayerNorm(config.width)
         self.head = nn.Linear(config.width, num_tokens, bias=False)
+        self.shared = None if code_features is None else SharedByCodes(code_features, config.width)
         self.apply(_initialise)
 
     def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
         """Return the logits at each position: of the next token if causal, else of the position's own."""
-        return self._logits(self.tok_emb(tokens) + self.pos_emb[:, : tokens.shape[1]])
+        return self._logits(F.embedding(tokens, self.embedding()) + self.pos_emb[:, : tokens.shape[1]])
 
     def _logits(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T K"]:
         x = self.drop(x)
         for block in self.blocks:
             x = block(x)
-        return self.head(self.ln_f(x))
+        return F.linear(self.ln_f(x), self.head_weight())
+
+    def embedding(self) -> Float[Tensor, "N C"]:
+        """Return the vector that stands for each token that is read."""
+        own = self.tok_emb.weight
+        return own if self.shared is None else own + self.shared.features @ self.shared.embedding
+
+    def head_weight(self) -> Float[Tensor, "K C"]:
+        """Return the vector whose product with the last block's output is the logit of each token."""
+        own = self.head.weight
+        return own if self.shared is None else own + self.shared.features @ self.shared.head
+
+
+class SharedByCodes(nn.Module):
+    """Weights that codes share by their features, beside the weights that each has of its own.
+
+    Args:
+        features: features of every code; codes that stand for alike things have alike features.
+        width: length of the vector that stands for a token.
+    """
+
+    features: Tensor
+
+    def __init__(self, features: Float[Tensor, "K F"], width: int) -> None:
+        super().__init__()
+        scaled = features * (_FEATURES_LENGTH / features.norm(dim=1, keepdim=True))
+        self.register_buffer("features", scaled, persistent=False)
+        self.embedding = nn.Parameter(torch.randn(features.shape[1], width) * 0.1)
+        self.head = nn.Parameter(torch.zeros(features.shape[1], width))
 
 
 class TokensAround(nn.Module):
@@ -182,22 +223,36 @@ class CausalTransformer(Transformer):
         num_tokens: number of different tokens.
         grid_size: rows and columns of the grid whose tokens it predicts: one sequence row by row, or windows of it
             column by column (``config.window_columns``).
+        code_features: features of every code, if ``config.code_features`` asks for them.
 
     Attributes:
         windows: the windows over the grid; None where the grid is one sequence.
     """
 
-    def __init__(self, config: TransformerConfig, num_tokens: int, grid_size: tuple[int, int]) -> None:
+    def __init__(
+        self,
+        config: TransformerConfig,
+        num_tokens: int,
+        grid_size: tuple[int, int],
+        code_features: Float[Tensor, "K F"] | None = None,
+    ) -> None:
+        if config.code_features and code_features is None:
+            cure = "take the tokenizer nearest_range, or leave it out"
+            raise ConfigError(
+                "model.transformer.code_features", "a tokenizer that knows what its codes stand for", cure
+            )
         rows, columns = grid_size
         windows = Windows(grid_size, config.window_columns) if config.window_columns else None
         length = rows * columns if windows is None else windows.length
-        super().__init__(config, num_tokens, num_tokens, length, causal=True)
+        shared = code_features if config.code_features else None
+        super().__init__(config, num_tokens, num_tokens, length, causal=True, code_features=shared)
         self.windows, self.column_emb, self.around = windows, None, None
         if windows is not None:
             self.column_emb = nn.Parameter(torch.zeros(columns, config.width))
         if config.neighbours:
             in_order = grid_size if windows is None else (windows.columns, rows)
             self.around = TokensAround(in_order, config.width, wraps=windows is None)
+            self.around.maps.data *= 1 if shared is None else _AROUND_IF_SHARED
 
     def forward(self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "B T K"]:
         """Return the logits of the next token at each position.
@@ -212,8 +267,9 @@ class CausalTransformer(Transformer):
         self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
     ) -> Float[Tensor, "B T C"]:
         """Return what the blocks read."""
-        x = self.tok_emb(tokens) + self.positions(columns)[..., : tokens.shape[1], :]
-        return x if self.around is None else x + self.around(tokens, self.around.tables(self.tok_emb.weight))
+        embedding = self.embedding()
+        x = F.embedding(tokens, embedding) + self.positions(columns)[..., : tokens.shape[1], :]
+        return x if self.around is None else x + self.around(tokens, self.around.tables(embedding))
 
     def positions(self, columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "*B T C"]:
         """Return what is learned of each position of a sequence, or of windows at these columns of the grid."""
@@ -227,7 +283,7 @@ class MaskedTransformer(Transformer):
     """Predicts the tokens of a sequence that are hidden, which it reads as ``mask_token``."""
 
     def __init__(self, config: TransformerConfig, num_tokens: int, context_length: int) -> None:
-        for setting in ("neighbours", "window_columns"):
+        for setting in ("neighbours", "code_features", "window_columns"):
             if getattr(config, setting):
                 cure = "leave it out, or take a generator of tokens one by one"
                 raise ConfigError(f"model.transformer.{setting} of masked tokens", "its default", cure)

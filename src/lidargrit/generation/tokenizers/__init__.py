@@ -67,6 +67,10 @@ class Tokenizer(Objective, Generic[Config]):
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
 
+    def code_features(self) -> Float[Tensor, "K F"] | None:
+        """Return numbers that tell what every code stands for, where that is known without training; else None."""
+        return None
+
     def for_decoding(self, precision: Precision) -> "Tokenizer[Config]":
         """Return a tokenizer with the same weights that only decodes, perhaps quicker or in 16 bits."""
         return self

@@ -25,6 +25,7 @@ _SHIFTS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
 _FINEST_M, _COARSEST_M = 0.01, 40.0
 _COMPONENTS_TOLD = 4  # the likeliest, to a pixel decoder; each costs it as much as a neighbour's range
 _TOLD = 2  # features of a pixel that are not learned: whether its part, and whether its cell, is at the nearest range
+_WAVES, _BUMP_LEVELS = 16, 4  # over the levels, by which codes of near levels share weights: how many, how wide
 _HEAD_START, _OF_PART = 4.0, 4.0  # of the logit of the own cell's range, and how much a pixel's part moves it
 
 
@@ -136,6 +137,17 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         parts = logits, mixture.centres.gather(-1, kept), mixture.log_scales.gather(-1, kept)
         components = torch.stack([part.movedim(-1, 1) for part in parts], 1)
         return Decoded(mixture.mode(), return_logits, self.sensor, features=features, components=components)
+
+    def code_features(self) -> Float[Tensor, "K F"]:
+        """Return of every code waves and bumps over its level, which parts are at the nearest range, and emptiness."""
+        config = self.config
+        code = torch.arange(config.num_codes - 1)
+        level, pattern = (code // config.num_patterns)[:, None].float(), (code % config.num_patterns)[:, None] + 1
+        waves = math.pi / config.levels * level * torch.arange(1, _WAVES + 1)
+        bumps = torch.exp(-0.5 * ((level - torch.arange(0, config.levels, _BUMP_LEVELS)) / _BUMP_LEVELS) ** 2)
+        parts = pattern.bitwise_right_shift(torch.arange(config.part_rows * config.part_columns)) & 1
+        of_codes = torch.cat((waves.sin(), waves.cos(), bumps, parts), 1)
+        return torch.block_diag(torch.ones(1, 1), of_codes)
 
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan."""

@@ -101,7 +101,8 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        self.transformer = CausalTransformer(config.transformer, self.tokenizer.num_codes, self.tokenizer.grid_size)
+        codes = self.tokenizer.num_codes, self.tokenizer.grid_size, self.tokenizer.code_features()
+        self.transformer = CausalTransformer(config.transformer, *codes)
         self._decoder_cache: _DecoderCache | None = None
         self._one_at_a_time = threading.Lock()
 
