@@ -173,7 +173,7 @@ def test_codes_that_share_weights_learn_from_one_another():
         network(read)[0, -1].log_softmax(-1)[0].backward()
         with torch.no_grad():
             for weight in (network.head.weight, *(() if features is None else (network.shared.head,))):
-                weight += 0.1 * weight.grad
+                weight.add_(weight.grad, alpha=0.1)
         moved = (network(read)[0, -1] - before).detach()
         assert moved[0] > 0
         assert (moved[1] > 0.5 * moved[0]) == alike

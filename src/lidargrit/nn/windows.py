@@ -18,7 +18,7 @@ class Window(NamedTuple):
 
     Args:
         columns: numbers of its columns in the grid.
-        known: how many of them, the first ones, earlier windows have.
+        known: number of its first columns that earlier windows have.
     """
 
     columns: Int[Tensor, "W"]
