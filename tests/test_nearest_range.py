@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
@@ -30,6 +31,14 @@ CONFIG = NearestRangeConfig(cell_rows=8, cell_columns=4, part_rows=2, part_colum
 PIXELS = PixelDecoderConfig(
     mask_features=2, range_features=2, mask_width=8, range_width=8, blocks=1, decoded_components=True
 )
+
+
+def test_operations_of_decoding_are_those_that_torch_counts():
+    tokenizer = NearestRangeTokenizer(CONFIG, SENSOR)
+    tokens = TokenGrid(torch.zeros((1, *tokenizer.grid_size), dtype=torch.long), tokenizer.num_codes)
+    with FlopCounterMode(display=False) as counter:
+        tokenizer.decode(tokens)
+    assert tokenizer.decoding_flops() == counter.get_total_flops()
 
 
 def test_features_tell_codes_apart_and_those_of_near_levels_or_of_most_parts_in_common_are_alike():

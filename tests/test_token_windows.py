@@ -151,6 +151,12 @@ def test_training_learns_windows_and_validation_the_whole_scan():
     assert float(whole) == pytest.approx(float(bits.mean()) * float(torch.tensor(2.0).log()), rel=1e-4)
 
 
+def test_the_cost_counts_a_step_for_every_token_and_a_pass_for_every_window_after_the_first():
+    generator = small_system()
+    steps, windows = 16 * generator.tokenizer.grid_size[1], generator.transformer.windows.in_turn()
+    assert generator.cost().network_evaluations == steps + len(windows) - 1 + 1  # and the tokenizer's decoder
+
+
 def test_positions_of_columns_are_resampled_for_a_grid_of_others_and_those_in_the_window_stay():
     wide, narrow = small_system(1024).transformer_objective(), small_system(512).transformer_objective()
     torch.nn.init.normal_(wide.transformer.column_emb)

@@ -151,7 +151,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
 
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan."""
-        cells, pixels = (1, self.config.width, *self.grid_size), (1, self.config.features, *self._size)
+        cells, pixels = (1, self.config.width, *self.grid_size), (1, self.num_features, *self._size)
         counted = flops_of(self.conv_in, (1, self.conv_in.in_channels, *self.grid_size))
         counted += flops_of(self.blocks, cells) + flops_of(self.to_pixels, cells) + flops_of(self.conv_out, pixels)
         return counted

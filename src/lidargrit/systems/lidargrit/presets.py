@@ -213,7 +213,7 @@ PRESETS = {
         replace(shared.WIDE_STREETS, train=("simulated:70000:train",), workers=16),
         LidarGritConfig(
             NearestRangeConfig(cell_rows=4, cell_columns=4, part_rows=1, part_columns=4),
-            TransformerConfig(heads=4, embedding_dropout=0.0, neighbours=True, window_columns=32),
+            TransformerConfig(heads=4, embedding_dropout=0.0, neighbours=True, code_features=True, window_columns=32),
             replace(
                 shared.PIXEL_DECODER,
                 mask_features=6,
