@@ -202,7 +202,7 @@ def test_earlier_ranges_of_training_are_partly_the_decoders_own_samples_within_t
     with torch.no_grad():
         decoded = tokenizer.decode(tokenizer.encode(images))
     guide, rng = pixels.guide(decoded, 8), torch.Generator().manual_seed(0)
-    known_m = pixels._partly_own(guide, images, rng)
+    known_m = pixels._partly_own(guide, images, rng, rng)
     assert torch.equal(known_m > 0, images.return_mask)
     own = (known_m != images.range_m).flatten(1).float().mean(1) > 0.5
     assert own.tolist() == [True] * 4 + [False] * 4

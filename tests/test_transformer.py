@@ -144,7 +144,9 @@ def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_the
     config = TransformerConfig(
         layers=2, heads=2, width=16, embedding_dropout=0.0, neighbours=True, code_features=shared
     )
-    transformer = CausalTransformer(config, num_tokens=20, grid_size=(4, 6), code_features=CODE_FEATURES).eval()
+    transformer = CausalTransformer(
+        config, num_tokens=20, grid_size=(4, 6), code_features=CODE_FEATURES if shared else None
+    ).eval()
     torch.nn.init.normal_(transformer.tok_emb.weight, std=0.5)
     torch.nn.init.normal_(transformer.head.weight, std=0.5)
     if shared:

@@ -253,11 +253,7 @@ class TokenObjective(Objective):
                 name, rows = "transformer.pos_emb", ours[0]
                 if "transformer.column_emb" in weights:  # positions in a window stay as they are
                     name, rows = "transformer.column_emb", 1
-                size = weights[name].shape[-1]
-                old = weights[name].view(1, -1, size)
-                weights[name] = resample_positions(old, (rows, theirs[1]), ours[1]).view(
-                    *weights[name].shape[:-2], -1, size
-                )
+                weights[name] = resample_positions(weights[name], (rows, theirs[1]), ours[1])
         return weights
 
     @torch.no_grad()

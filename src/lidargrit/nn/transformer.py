@@ -223,7 +223,7 @@ class CausalTransformer(Transformer):
         num_tokens: number of different tokens.
         grid_size: rows and columns of the grid whose tokens it predicts: one sequence row by row, or windows of it
             column by column (``config.window_columns``).
-        code_features: features of every code, if ``config.code_features`` asks for them.
+        code_features: features of every code, by which codes share weights; wanted if ``config.code_features``.
 
     Attributes:
         windows: the windows over the grid; None where the grid is one sequence.
@@ -244,15 +244,15 @@ class CausalTransformer(Transformer):
         rows, columns = grid_size
         windows = Windows(grid_size, config.window_columns) if config.window_columns else None
         length = rows * columns if windows is None else windows.length
-        shared = code_features if config.code_features else None
-        super().__init__(config, num_tokens, num_tokens, length, causal=True, code_features=shared)
+        super().__init__(config, num_tokens, num_tokens, length, causal=True, code_features=code_features)
         self.windows, self.column_emb, self.around = windows, None, None
         if windows is not None:
-            self.column_emb = nn.Parameter(torch.zeros(columns, config.width))
+            self.column_emb = nn.Parameter(torch.zeros(1, columns, config.width))
         if config.neighbours:
             in_order = grid_size if windows is None else (windows.columns, rows)
             self.around = TokensAround(in_order, config.width, wraps=windows is None)
-            self.around.maps.data *= 1 if shared is None else _AROUND_IF_SHARED
+            if self.shared is not None:
+                self.around.maps.data *= _AROUND_IF_SHARED
 
     def forward(self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "B T K"]:
         """Return the logits of the next token at each position.
@@ -273,10 +273,10 @@ class CausalTransformer(Transformer):
 
     def positions(self, columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "*B T C"]:
         """Return what is learned of each position of a sequence, or of windows at these columns of the grid."""
-        if self.windows is None or self.column_emb is None or columns is None:
+        if self.column_emb is None or columns is None:
             return self.pos_emb[0]
-        of_columns = self.column_emb[columns.to(self.column_emb.device)]
-        return self.pos_emb[0] + of_columns.repeat_interleave(self.windows.grid_size[0], -2)
+        of_columns = self.column_emb[0, columns.to(self.column_emb.device)]
+        return self.pos_emb[0] + of_columns.repeat_interleave(self.context_length // columns.shape[-1], -2)
 
 
 class MaskedTransformer(Transformer):

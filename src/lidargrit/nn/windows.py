@@ -60,16 +60,12 @@ class Windows:
 
     def in_turn(self) -> list[Window]:
         """Return the windows that together have every column, in the order in which they are sampled."""
-        found, done, own = [self.beginning()], self.columns, self.columns - self.first
+        found, done, own = [Window(self._columns(self.first), 0)], self.columns, self.columns - self.first
         while done < self.grid_size[1]:
             start = min(done - own // 2, self.grid_size[1] - own)
             found.append(Window(self._columns(start), self.first + done - start))
             done = start + own
         return found
-
-    def beginning(self) -> Window:
-        """Return the first window."""
-        return Window(torch.arange(self.columns), 0)
 
     def draw(self, count: int, rng: torch.Generator) -> tuple[Int[Tensor, "B W"], Bool[Tensor, "B W"]]:
         """Return the columns of random windows, and which of these a training is to learn.
@@ -79,16 +75,17 @@ class Windows:
             rng: random numbers on the CPU.
         """
         last = self.grid_size[1] - (self.columns - self.first)
-        starts = torch.randint(self.first + 1, last + 1, (count,), generator=rng)
-        is_first = torch.rand(count, generator=rng) < _FIRST_SHARE
-        others = torch.stack([self._columns(int(start)) for start in starts])
-        columns = torch.where(is_first[:, None], torch.arange(self.columns), others)
-        return columns, is_first[:, None] | (torch.arange(self.columns) >= self.first)
+        starts = torch.randint(self.first + 1, last + 1, (count, 1), generator=rng)
+        is_first = torch.rand((count, 1), generator=rng) < _FIRST_SHARE
+        columns = self._columns(torch.where(is_first, self.first, starts))
+        return columns, is_first | (torch.arange(self.columns) >= self.first)
 
     def take(self, grid: Shaped[Tensor, "B h w"], columns: Int[Tensor, "*C W"]) -> Shaped[Tensor, "B T"]:
         """Return what a grid has in windows, column by column."""
         columns = columns.to(grid.device).expand(len(grid), -1)
         return grid.gather(2, columns[:, None].expand(-1, grid.shape[1], -1)).transpose(1, 2).flatten(1)
 
-    def _columns(self, start: int) -> Int[Tensor, "W"]:
-        return torch.cat((torch.arange(self.first), torch.arange(start, start + self.columns - self.first)))
+    def _columns(self, start: int | Int[Tensor, "B 1"]) -> Int[Tensor, "*B W"]:
+        """Return the first columns, and those that begin at ``start``; at ``first`` it is the first window."""
+        number = torch.arange(self.columns)
+        return torch.where(number < self.first, number, number - self.first + start)

@@ -184,12 +184,14 @@ class PixelDecoder(RayNetwork):
         """
         pixels, images = images.range_m.numel(), self._whole(images)
         guide = self.guide(decoded, len(images))
-        known_m = self._partly_own(guide, images, rng) if self.training and self.config.own_context else images.range_m
+        known_m, host = images.range_m, of_host(rng)
+        if self.training and self.config.own_context:
+            known_m = self._partly_own(guide, images, rng, host)
         guided = self.mask.guided(guide), self.range.guided(guide)
         mask_nats, range_nats = guide.v.new_zeros(()), guide.v.new_zeros(())
-        returns, rng = guide.v.new_zeros(()), of_host(rng)
+        returns = guide.v.new_zeros(())
         for phases in self.mask.by_lattice():
-            chosen = one_of_phases(phases, rng) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
+            chosen = one_of_phases(phases, host) if phases[0].lattice.area < _ALL_PHASES_AREA else phases
             of_mask, of_range = self._nll(chosen, guided, guide, images, known_m=known_m)
             share = len(phases) / len(chosen)
             mask_nats = mask_nats + share * of_mask.sum()
@@ -231,11 +233,13 @@ class PixelDecoder(RayNetwork):
         return of_mask, torch.where(returned, -likelihood, 0.0)
 
     @torch.no_grad()
-    def _partly_own(self, guide: Guide, images: RangeImage, rng: torch.Generator) -> Float[Tensor, "B H W"]:
+    def _partly_own(
+        self, guide: Guide, images: RangeImage, rng: torch.Generator, host: torch.Generator
+    ) -> Float[Tensor, "B H W"]:
         """Return the ranges of scans, those of a random share of them sampled within the true masks."""
         device, size = guide.v.device, (len(images), 2, *guide.v.shape[1:])
         uniform = torch.rand(size, generator=rng, device=rng.device).to(device)
-        chance = torch.rand((), generator=of_host(rng), device="cpu")
+        chance = torch.rand((), generator=host, device="cpu")
         count = int(len(images) * self.config.own_context + float(chance))
         if not count:
             return images.range_m

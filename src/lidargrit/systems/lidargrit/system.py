@@ -101,8 +101,9 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
 
     def __init__(self, config: LidarGritConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
-        codes = self.tokenizer.num_codes, self.tokenizer.grid_size, self.tokenizer.code_features()
-        self.transformer = CausalTransformer(config.transformer, *codes)
+        features = self.tokenizer.code_features() if config.transformer.code_features else None
+        sizes = self.tokenizer.num_codes, self.tokenizer.grid_size
+        self.transformer = CausalTransformer(config.transformer, *sizes, features)
         self._decoder_cache: _DecoderCache | None = None
         self._one_at_a_time = threading.Lock()
 
