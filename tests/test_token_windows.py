@@ -151,6 +151,34 @@ def test_training_learns_windows_and_validation_the_whole_scan():
     assert float(whole) == pytest.approx(float(bits.mean()) * float(torch.tensor(2.0).log()), rel=1e-4)
 
 
+def test_a_training_reads_as_many_windows_of_each_scan_as_are_asked_for_and_counts_each_alike():
+    generator = small_system()
+    generator.transformer.config = replace(generator.transformer.config, windows_per_scan=3)
+    sensor = generator.sensor
+    range_m = 5 + 20 * torch.rand((2, sensor.height, sensor.width), generator=torch.Generator().manual_seed(0))
+    images = RangeImage.masked(range_m, range_m < 22, sensor)
+    objective = generator.transformer_objective().train()
+    loss = objective(Example(images), torch.Generator().manual_seed(5))["loss"].detach()
+    grid = generator.get_tokenizer().encode(images).tokens
+    windows = generator.transformer.windows
+    columns, counted = windows.draw(6, torch.Generator().manual_seed(5))
+    nats, count = 0.0, 0
+    for number in range(6):  # a slow loop: the windows of one scan follow one another
+        tokens = grid[number // 3][:, columns[number]].t().flatten()[None]
+        inputs = torch.cat((torch.zeros(1, 1, dtype=torch.long), tokens[:, :-1]), 1)
+        logits = generator.transformer(inputs, columns[number : number + 1])
+        each = torch.nn.functional.cross_entropy(logits[0], tokens[0], reduction="none").unflatten(0, (8, 16))
+        nats, count = nats + float(each.detach()[counted[number]].sum()), count + 16 * int(counted[number].sum())
+    assert float(loss) == pytest.approx(nats / count, rel=1e-4)
+
+
+def test_several_windows_of_a_scan_without_windows_get_one_line():
+    with pytest.raises(
+        ConfigError, match="windows_per_scan=2 without windows; wanted model.transformer.window_columns"
+    ):
+        TransformerConfig(windows_per_scan=2)
+
+
 def test_the_cost_counts_a_step_for_every_token_and_a_pass_for_every_window_after_the_first():
     generator = small_system()
     steps, windows = 16 * generator.tokenizer.grid_size[1], generator.transformer.windows.in_turn()

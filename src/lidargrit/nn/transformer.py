@@ -58,6 +58,7 @@ def attend(
 _AROUND = ((0, -2), (0, -3), *((-1, right) for right in range(-2, 3)), (-2, -1), (-2, 0), (-2, 1), (-3, 0))
 _FEATURES_LENGTH = 3.0  # of each code's: what codes share then moves more quickly than what each has of its own
 _AROUND_IF_SHARED = 0.3  # of the usual first weights of the tokens around, since shared embeddings begin longer
+_WINDOWS_AT_MOST = 64  # of a scan: beyond, each column is learned many times over
 _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
 
 
@@ -76,8 +77,9 @@ class TransformerConfig(Settings):
         code_features: whether codes share weights by what they stand for, such as their range, so that a rare code is
             learned from those like it. The tokenizer has to know what its codes stand for, as ``nearest_range`` does.
         window_columns: number of columns of tokens that are read at once, column by column, as the sensor turns; half
-            of them go on from earlier ones. 0 reads whole scans, row by row, as in the paper. A training reads one
-            window of each scan.
+            of them go on from earlier ones. 0 reads whole scans, row by row, as in the paper.
+        windows_per_scan: number of windows that a training reads of each scan. More of them spare loading scans, which
+            takes a core some milliseconds; but those of one scan are alike, and teach less.
     """
 
     layers: Annotated[int, Bounds(1, _LAYERS_AT_MOST)] = 6
@@ -88,9 +90,15 @@ class TransformerConfig(Settings):
     neighbours: bool = False
     code_features: bool = False
     window_columns: NotNegative = 0
+    windows_per_scan: Annotated[int, Bounds(1, _WINDOWS_AT_MOST)] = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.windows_per_scan > 1 and not self.window_columns:
+            got = f"model.transformer.windows_per_scan={self.windows_per_scan} without windows"
+            raise ConfigError(
+                got, "model.transformer.window_columns, or 1", "add --set model.transformer.window_columns=32"
+            )
         if self.width % self.heads:
             got = f"heads={self.heads}, width={self.width}"
             raise ConfigError(got, "a width that is a multiple of the heads", "change the width or the heads")

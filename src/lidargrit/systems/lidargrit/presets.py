@@ -213,7 +213,14 @@ PRESETS = {
         replace(shared.WIDE_STREETS, train=("simulated:70000:train",), workers=16),
         LidarGritConfig(
             NearestRangeConfig(cell_rows=4, cell_columns=4, part_rows=1, part_columns=4),
-            TransformerConfig(heads=4, embedding_dropout=0.0, neighbours=True, code_features=True, window_columns=32),
+            TransformerConfig(
+                heads=4,
+                embedding_dropout=0.0,
+                neighbours=True,
+                code_features=True,
+                window_columns=32,
+                windows_per_scan=4,
+            ),
             replace(
                 shared.PIXEL_DECODER,
                 mask_features=6,
@@ -225,7 +232,7 @@ PRESETS = {
             ),
         ),
         tokenizer=replace(_RELAYED, scans=10_000, learning_rate=2e-3, augmentations=("flip",)),
-        transformer=replace(_RELAYED, scans=400_000, optimiser="muon", learning_rate=3e-3),
+        transformer=replace(_RELAYED, scans=100_000, optimiser="muon", learning_rate=3e-3),
         pixels=_RELAYED,
     ),
     "lidargrit_demo": preset(

@@ -230,12 +230,13 @@ class NextToken(TokenObjective):
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:
         """Return eq. 6 of the paper per token, beside it that of a model which knows only how often tokens occur.
 
-        In training over windows, it is that of one window of each scan.
+        In training over windows, it is that of a few windows of each scan.
         """
         tokens, unigram_nll = self.encode(example)
         grid, windows = tokens.unflatten(1, self.grid_size), self.transformer.windows
         if self.training and windows is not None:
-            columns, counts = windows.draw(len(tokens), of_host(rng))
+            grid = grid.repeat_interleave(self.transformer.config.windows_per_scan, 0)
+            columns, counts = windows.draw(len(grid), of_host(rng))
             counts = counts.to(tokens.device).repeat_interleave(windows.grid_size[0], 1)
             loss = (_nats(self.transformer, windows.take(grid, columns), columns) * counts).sum() / counts.sum()
         else:
