@@ -174,7 +174,7 @@ def test_a_training_reads_as_many_windows_of_each_scan_as_are_asked_for_and_coun
 
 def test_several_windows_of_a_scan_without_windows_get_one_line():
     with pytest.raises(
-        ConfigError, match="windows_per_scan=2 without windows; wanted model.transformer.window_columns"
+        ConfigError, match=r"windows_per_scan=2 without windows; wanted model\.transformer\.window_columns"
     ):
         TransformerConfig(windows_per_scan=2)
 
