@@ -14,7 +14,7 @@ from lidargrit.simulator.scene.body_types import BODY_TYPES
 from lidargrit.simulator.scene.layout import driving, parked
 from lidargrit.simulator.scene.objects import Placements
 from lidargrit.simulator.scene.settlement import lay_out_houses
-from lidargrit.simulator.scene.street_plan import sample_street_plan
+from lidargrit.simulator.scene.plan_sampling import sample_street_plan
 from lidargrit.simulator.scene.vehicles import make_vehicles, vehicle_shape
 from lidargrit.simulator.tracing import objects_in_reach
 
