@@ -175,11 +175,7 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
             u = np.full(len(v), street.u_m + flank * (street.half_m - 1.0))
             turn = rng.choice([0.0, np.pi], len(v)) + rng.normal(0, 0.025, len(v))
             placements.append(Placements.of(u, v, turn, across=True))
-    placements += [
-        _court(rng, plan, town, side)
-        for side in (-1, 1)
-        if plan.court_m(side) and plan.own_streets is plan.side_streets
-    ]
+    placements += [_court(rng, plan, town, side) for side in (-1, 1) if plan.court_m(side)]
     wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & plan.stretch.keeps(town.gaps_m[:, 0], 70.0)]
     wide = wide[rng.random(len(wide)) < {"city": 0.2, "suburb": 0.45, "country": 0.2}[plan.theme]]
     u, side = wide[:, 0] + 1.7, wide[:, 2]
