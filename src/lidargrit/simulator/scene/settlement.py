@@ -204,8 +204,10 @@ def _stand_across(rng: np.random.Generator, plan: StreetPlan) -> list[tuple[Plac
             blocks.append((placement, extent, np.array([[length, depth]])))
     for end, way in zip(plan.ends_m, (-1, 1), strict=True):
         if np.isfinite(end):
-            reach = plan.farthest_front_m + 20.0
-            start, length = _row(rng, "city", (-reach, reach))  # hardly a gap
+            reach, wide, middle = plan.farthest_front_m + 20.0, rng.uniform(6, 11), rng.uniform(-3, 3)
+            rows = [_row(rng, plan.theme, span) for span in ((-reach, middle - wide), (middle + wide, reach))]
+            start = np.concatenate((rows[0][0], rows[1][0], [middle - wide]))  # the last one closes the view
+            length = np.concatenate((rows[0][1], rows[1][1], [2 * wide]))
             depth = rng.uniform(*_DEPTH_M[plan.theme], len(start))
             near = end + way * (rng.uniform(0.5, 4.0) + _steps(rng, len(start)))
             far = near + way * depth
