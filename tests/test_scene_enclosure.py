@@ -51,7 +51,7 @@ def test_no_house_behind_the_rows_stands_on_the_road_where_it_turns_back(theme):
     turns = 0
     for plan, rng in plans(theme, seeds=range(25)):
         houses = lay_out_houses(rng, plan).houses
-        along = np.linspace(*np.clip(plan.ends_m, -110, 110), 441)
+        along = np.linspace(max(plan.ends_m[0], -110.0), min(plan.ends_m[1], 110.0), 441)
         road = world(plan, along, 0 * along)
         turn = abs(np.diff(np.unwrap(np.arctan2(*np.diff(road, axis=0).T[::-1]))).sum())
         turns = max(turns, turn)
@@ -155,7 +155,7 @@ def test_thickets_keep_off_roads_and_houses():
 
 def test_cars_fill_the_lanes_of_wide_roads_and_the_squares_before_houses():
     wide = plans("city", lambda plan: plan.outer_lanes(-1) > 0, range(200))
-    assert 40 < len(wide) < 120
+    assert 15 < len(wide) < 80
     for plan, rng in wide[:20]:
         outer = -plan.lane_m * (plan.lanes / 2 + 0.5 + np.arange(plan.outer_lanes(-1)))
         assert outer[-1] - plan.lane_m / 2 > plan.edge(-1) - 1e-9

@@ -55,7 +55,8 @@ def _thickets(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> l
     free &= from_road_m(plan, u, v) > plan.farthest_front_m + reach
     if np.isfinite(plan.bridge_u_m):
         free &= np.abs(u - plan.bridge_u_m) > 16 + beside
-    return [make_thickets(rng, *rows[free].T, plan.level_m[1])]
+    u, v, turn = rows[free].T
+    return [make_thickets(rng, u, v, turn, plan.level_m[1])]
 
 
 def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:
