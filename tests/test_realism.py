@@ -57,7 +57,7 @@ def test_other_columns_than_are_fired_get_the_nearest_of_several_points_as_real_
     ]
     single = simulate_pair(0, rays)[1].return_mask == real.return_mask[0]  # one ray for each pixel
     assert min(agree) > 0.98
-    assert float(single.float().mean()) < 0.96
+    assert float(single.float().mean()) < 0.975
 
 
 def test_independent_drops_keep_a_share_whatever_it_meets(simulated):

@@ -13,8 +13,8 @@ from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.body_types import BODY_TYPES
 from lidargrit.simulator.scene.layout import driving, parked
 from lidargrit.simulator.scene.objects import Placements
+from lidargrit.simulator.scene.plan_sampling import sample_street_plan
 from lidargrit.simulator.scene.settlement import lay_out_houses
-from lidargrit.simulator.scene.street_plan import sample_street_plan
 from lidargrit.simulator.scene.vehicles import make_vehicles, vehicle_shape
 from lidargrit.simulator.tracing import objects_in_reach
 
@@ -139,7 +139,7 @@ def test_parked_cars_stand_at_kerbs_and_not_in_houses(theme):
         assert np.all((kerb > 0.9) & (kerb < 1.15))  # half a car and a hand
         assert (plan.in_side_street(placements.u_m[along], placements.v_m[along], 2.0) < 0).all()
         at_kerb, all_along = at_kerb + along.sum(), all_along + len(placements)
-    assert at_kerb > 0.4 * all_along > 60
+    assert at_kerb > 0.3 * all_along > 60  # others stand in side streets, beside houses, and in squares
 
 
 def test_drivers_keep_their_distance():

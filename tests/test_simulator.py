@@ -119,8 +119,8 @@ def test_kept_columns_are_those_of_the_whole_scan(sensor, options):
 
 
 def test_frames_are_a_drive_through_one_street():
-    one, two = (observe(2, theme="suburb", frame=frame) for frame in (0, 10))
-    assert np.array_equal(poses_of(2, [1.0], theme="suburb")[0], two.sensor_pose)
+    one, two = (observe(0, theme="suburb", frame=frame) for frame in (0, 10))
+    assert np.array_equal(poses_of(0, [1.0], theme="suburb")[0], two.sensor_pose)
     way_m = np.linalg.norm(two.sensor_pose[:3, 3] - one.sensor_pose[:3, 3])
     assert 0.5 < way_m < 25
 
@@ -135,9 +135,9 @@ def test_frames_are_a_drive_through_one_street():
 
 
 def test_motion_bends_the_points_and_only_so():
-    still, moving = (observe(2, theme="suburb", motion=motion) for motion in (False, True))
+    still, moving = (observe(0, theme="suburb", motion=motion) for motion in (False, True))
     assert np.array_equal(still.directions, moving.directions)  # in the sensor's own frame
-    speed_m_s = np.linalg.norm(observe(2, theme="suburb", frame=1).sensor_pose[:3, 3] - still.sensor_pose[:3, 3]) / 0.1
+    speed_m_s = np.linalg.norm(observe(0, theme="suburb", frame=1).sensor_pose[:3, 3] - still.sensor_pose[:3, 3]) / 0.1
     both = (still.label == moving.label) & (still.clean_range_m > 0) & (still.clean_range_m < 40)
     apart = np.abs(still.clean_range_m - moving.clean_range_m)
     begun = both & (np.arange(2048) < 1024) & (np.arange(2048) > 1000)  # just left of straight ahead: fired first
@@ -176,7 +176,7 @@ def test_numbers_of_the_model_reach_the_scan(sensor):
         return observe(1, sensor, kept_columns_only=True, model=replace(MODEL, **changes)).return_mask.mean()
 
     assert share(least_power=MODEL.least_power * 10) < share() - 0.05
-    assert share(extinction_per_m=0.02) < share() - 0.02
+    assert share(extinction_per_m=0.03) < share() - 0.02
 
 
 def test_wet_road_returns_less(sensor):

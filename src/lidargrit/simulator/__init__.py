@@ -17,7 +17,7 @@ from lidargrit.simulator.observation import Observation, ObservationConfig, obse
 from lidargrit.simulator.power import RaydropModel
 from lidargrit.simulator.scene import Scene, Theme, sample_scene
 from lidargrit.simulator.scene.long_road import LongRoad
-from lidargrit.simulator.scene.street_plan import sample_street_plan
+from lidargrit.simulator.scene.plan_sampling import sample_street_plan
 from lidargrit.simulator.scene.stretches import EXTENT_M
 from lidargrit.simulator.setups import setup_of
 

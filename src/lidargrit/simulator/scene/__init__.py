@@ -10,7 +10,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.scene.objects import ObjectBatch
 from lidargrit.simulator.scene.parts import lay_out_first
-from lidargrit.simulator.scene.street_plan import StreetPlan, Theme, sample_street_plan
+from lidargrit.simulator.scene.plan_sampling import sample_street_plan
+from lidargrit.simulator.scene.street_plan import StreetPlan, Theme
 
 __all__ = ["Scene", "Theme", "sample_scene"]
 

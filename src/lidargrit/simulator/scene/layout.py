@@ -1,4 +1,4 @@
-"""Positions of everything but houses: a plan and its houses → gardens, trees, street furniture, traffic, people."""
+"""Positions of everything but houses and trees: a plan and its houses → gardens, street furniture, traffic, people."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from lidargrit.simulator.scene import barriers, furniture
 from lidargrit.simulator.scene.body_types import HATCHBACK
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.people import make_cyclists, make_walkers
-from lidargrit.simulator.scene.plants import make_bushes, make_hedges, make_trees
+from lidargrit.simulator.scene.plants import make_hedges
 from lidargrit.simulator.scene.settlement import Settlement, free_spans
 from lidargrit.simulator.scene.shapes import MeshBuilder, rows_of
 from lidargrit.simulator.scene.street_plan import StreetPlan
@@ -20,7 +20,8 @@ _MET_APART_M = 8.0  # from where we meet one car to where we meet the next, at l
 _PASSES_M = 1.6  # from the middle of our car to a cyclist's, at least
 _SLOWER = 0.4  # than our car are walkers whom it meets later, at least, so that they come into sight far away
 _PARKED_SHARE = {"city": (0.25, 0.85), "suburb": (0.1, 0.65), "country": (0.0, 0.1)}
-_TRAFFIC = {"city": 3.0, "suburb": 1.2, "country": 1.5}
+_TRAFFIC = {"city": 4.0, "suburb": 1.5, "country": 1.5}
+_OUTER_GAP_M = 22.0  # beyond the least, between cars in the outer lanes of a wide road
 _WALKERS = {"city": 5.0, "suburb": 1.0, "country": 0.15}
 _CYCLISTS = {"city": 0.8, "suburb": 0.35, "country": 0.15}
 _ABOUT = {"city": 12.0, "suburb": 5.0, "country": 0.0}  # things that stand about on each pavement
@@ -89,85 +90,6 @@ def _add_lines(
     return hedges
 
 
-def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> list[ObjectBatch]:
-    """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
-    green = rng.uniform(0.3, 1.0)
-    lots = [*_parks(rng, town), *(_woods(rng, plan.stretch) if plan.theme == "country" else [])]
-    count = rng.poisson(
-        {"city": 90, "suburb": 160, "country": 60}[plan.theme] * green * plan.stretch.share_around(55.0)
-    )
-    lots.append(np.column_stack((plan.stretch.around(rng, 55.0, count), rng.normal(0, 45, count))))
-    trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
-    u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
-    wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
-    count = rng.poisson(
-        {"city": 45, "suburb": 170, "country": 60}[plan.theme] * green * plan.stretch.share_around(35.0)
-    )
-    points = [np.column_stack((plan.stretch.around(rng, 35.0, count), rng.normal(0, 18, count))), *_parks(rng, town)]
-    u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
-    return [*wood, make_bushes(rng, u, v, plan.level_m[1])]
-
-
-def _plantable(plan: StreetPlan, town: Settlement, points: np.ndarray, spare_m: float) -> np.ndarray:
-    """Return the points (n, 2) that lie off roads and houses, and within the sensor's reach."""
-    u, v = points.T
-    keep = _off_road(plan, u, v, spare_m) & ~town.covers(u, v, 0.5 * spare_m)
-    keep &= (np.hypot(u, v) if plan.stretch is Stretch.FIRST else np.abs(v)) < 115
-    return points[keep]
-
-
-def _parks(rng: np.random.Generator, town: Settlement) -> list[np.ndarray]:
-    """Sample positions in the stretches without houses, denser near the road."""
-    lots = []
-    for u_from, u_to, side in town.parks_m:
-        count = rng.poisson((u_to - u_from) * rng.uniform(0.1, 0.5))
-        away = 4.0 + 45.0 * rng.random(count) ** 1.5
-        lots.append(np.column_stack((rng.uniform(u_from, u_to, count), side * away)))
-    return lots
-
-
-def _woods(rng: np.random.Generator, stretch: Stretch) -> list[np.ndarray]:
-    """Sample clumps of trees, and long rows of them that bound fields."""
-    lots = []
-    for _ in range(rng.poisson(2.5 * stretch.share_around(55.0))):
-        count = rng.integers(12, 36)
-        middle = stretch.around(rng, 55.0, 1)[0], rng.choice([-1, 1]) * rng.uniform(18, 80)
-        lots.append(np.column_stack((rng.normal(middle[0], 14, count), rng.normal(middle[1], 8, count))))
-    for side in (-1, 1):
-        row = np.arange(*stretch.span(110.0), rng.uniform(3.0, 6.0))
-        lots.append(np.column_stack((row, side * rng.uniform(35, 85) + rng.normal(0, 2.0, len(row)))))
-    for _ in range(2):
-        column = np.arange(20.0, 110.0, rng.uniform(3.0, 6.0)) * rng.choice([-1, 1])
-        lots.append(np.column_stack((stretch.around(rng, 60.0, 1) + rng.normal(0, 2.0, len(column)), column)))
-    return lots
-
-
-def _tree_rows(rng: np.random.Generator, plan: StreetPlan) -> list[np.ndarray]:
-    """Sample rows of trees along our road."""
-    rows = []
-    for which, side in enumerate((-1, 1)):
-        wide = plan.theme == "country" or plan.pavement_m[which] > 1.8
-        if not wide or rng.random() > {"city": 0.45, "suburb": 0.35, "country": 0.4}[plan.theme]:
-            continue
-        row = np.arange(*plan.stretch.span(90.0), rng.uniform(7, 16)) + rng.uniform(-3, 3)
-        away = plan.edge_m[which] + (0.9 if plan.theme != "country" else rng.uniform(2.0, 5.0))
-        row = row[(plan.in_side_street(row, row * 0 + side * away, 2.5) < 0) & (rng.random(len(row)) < 0.85)]
-        rows.append(np.column_stack((row, np.full(len(row), side * away))))
-    return rows
-
-
-def _off_road(plan: StreetPlan, u: np.ndarray, v: np.ndarray, spare_m: float) -> np.ndarray:
-    """Return which points are clear of roads and pavements."""
-    edge = np.where(v > 0, plan.edge_m[1] + plan.pavement_m[1], plan.edge_m[0] + plan.pavement_m[0])
-    pavement = max((s.pavement_m for s in plan.side_streets), default=0.0)
-    return (np.abs(v) > edge + spare_m * 0.6) & (plan.in_side_street(u, v, pavement + spare_m * 0.6) < 0)
-
-
-def _clear_of_bridge(plan: StreetPlan, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    keep = np.abs(u - plan.bridge_u_m) > 14.0 if np.isfinite(plan.bridge_u_m) else np.ones(len(u), bool)
-    return u[keep], v[keep]
-
-
 def things(rng: np.random.Generator, plan: StreetPlan) -> ObjectBatch:
     """Set lamps, signs, and all that stands about on pavements."""
     wild = plan.theme == "country"
@@ -228,7 +150,7 @@ def _beside(plan: StreetPlan, *columns: float | np.ndarray) -> np.ndarray:
     """Return rows of u, v and more without those in the mouths of side streets and below the bridge."""
     rows = rows_of(*columns)
     near_bridge = np.abs(rows[:, 0] - plan.bridge_u_m) < 14.0
-    beyond = rows[:, 0] > plan.stretch.half_m
+    beyond = (rows[:, 0] > plan.stretch.half_m) | ~plan.goes_on(rows[:, 0])
     return rows[~(near_bridge | beyond) & (plan.in_side_street(rows[:, 0], rows[:, 1], 1.0) < 0)]
 
 
@@ -242,17 +164,18 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
             u = low + np.cumsum(rng.uniform(5.3, 7.2, at_most))
             u = u[(u < high) & (rng.random(at_most) < rng.uniform(*_PARKED_SHARE[plan.theme]))]
             v = side * (plan.edge_m[which] - rng.uniform(0.98, 1.08, len(u)))
-            clear = plan.in_side_street(u, v, 4.0) < 0
+            clear = (plan.in_side_street(u, v, 4.0) < 0) & plan.goes_on(u)
             turn = np.where(rng.random(len(u)) < 0.85, 0.0 if side < 0 else np.pi, np.pi if side < 0 else 0.0)
             placements.append(Placements.of(u, v, turn + rng.normal(0, 0.025, len(u))).select(clear))
     for street in plan.own_streets:
         for side in street.sides if street.half_m > 2.7 and plan.theme != "country" else ():
             flank = rng.choice([-1, 1])
             v = abs(plan.edge(side)) + 8.0 + np.cumsum(rng.uniform(5.4, 7.5, 11))
-            v = side * v[rng.random(11) < rng.uniform(*_PARKED_SHARE[plan.theme])]
+            v = side * v[(rng.random(11) < rng.uniform(*_PARKED_SHARE[plan.theme])) & (v < street.end_m - 4)]
             u = np.full(len(v), street.u_m + flank * (street.half_m - 1.0))
             turn = rng.choice([0.0, np.pi], len(v)) + rng.normal(0, 0.025, len(v))
             placements.append(Placements.of(u, v, turn, across=True))
+    placements += [_court(rng, plan, town, side) for side in (-1, 1) if plan.court_m(side)]
     wide = town.gaps_m[(town.gaps_m[:, 1] - town.gaps_m[:, 0] > 3.2) & plan.stretch.keeps(town.gaps_m[:, 0], 70.0)]
     wide = wide[rng.random(len(wide)) < {"city": 0.2, "suburb": 0.45, "country": 0.2}[plan.theme]]
     u, side = wide[:, 0] + 1.7, wide[:, 2]
@@ -263,12 +186,25 @@ def parked(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> Plac
     return Placements.join(placements)
 
 
+def _court(rng: np.random.Generator, plan: StreetPlan, town: Settlement, side: int) -> Placements:
+    """Sample cars that stand side by side on a place before the houses, in one row or two with a way between."""
+    kerb = plan.edge_m[(side + 1) // 2] + plan.pavement_m[(side + 1) // 2]
+    rows = kerb + np.array([3.0, 14.0])[: 1 + (plan.court_m(side) > 16.5)]
+    low, high = plan.stretch.span(60.0)
+    u, v = (a.ravel() for a in np.meshgrid(np.arange(low + 2, high - 2, rng.uniform(2.6, 3.1)), rows))
+    v = side * (v + rng.normal(0, 0.15, len(v)))
+    keep = (rng.random(len(u)) < rng.uniform(*_PARKED_SHARE[plan.theme])) & (plan.in_side_street(u, v, 5.0) < 0)
+    keep &= plan.goes_on(u) & ~town.covers(u, v, 2.6) & ~(np.abs(u - plan.bridge_u_m) < 18)
+    turn = rng.choice([0.0, np.pi], len(u)) + rng.normal(0, 0.03, len(u))
+    return Placements.of(u, v, turn, across=True, rise_m=plan.level_m[1]).select(keep)
+
+
 def driving(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Placements:
     """Sample who drives: ahead of us and behind at our speed, towards us, and away into side streets."""
     placements = []
     for ahead in (-1, 1):
         count = rng.poisson(_TRAFFIC[plan.theme] / 3)
-        gap = _OUR_LENGTH_M + 0.6 * speed_m_s + rng.exponential(14.0, count)
+        gap = _OUR_LENGTH_M + 0.6 * speed_m_s + rng.exponential(18.0, count)
         u = ahead * (np.cumsum(gap) + 3.0)
         placements.append(Placements.of(u, plan.our_v_m + rng.normal(0, 0.1, count), 0.0, speed_m_s))
     count = rng.poisson(_TRAFFIC[plan.theme] / 2)
@@ -276,16 +212,36 @@ def driving(rng: np.random.Generator, plan: StreetPlan, speed_m_s: float) -> Pla
     if plan.lanes == 1:  # the way is too narrow to meet: far ones only
         u = u[u > 30 + 5 * speed_m_s]
     fast = max(speed_m_s, 3.0) * rng.uniform(0.8, 1.2)
+    if np.isfinite(plan.ends_m[0]):  # they would get there in our sight
+        u = u[(u > 5) & (speed_m_s > 0)]
     side = plan.lane_m / 2 if plan.lanes == 2 else 0.0
     placements.append(Placements.of(u, side, np.pi, fast))
+    placements += _outer_traffic(rng, plan, speed_m_s, fast)
     for street in plan.side_streets:
-        if rng.random() < 0.2:
+        if rng.random() < 0.2 and np.isinf(street.end_m):
             way = street.sides[0]
             turn = 0.0 if way > 0 else np.pi
             at = np.array([way * (abs(plan.edge(way)) + rng.uniform(6, 40))])
             placements.append(Placements.of(at * 0 + street.u_m, at, turn, rng.uniform(3, 9), across=True))
     every = Placements.join(placements)
-    return every.select(np.abs(every.u_m) < 105)
+    return every.select((np.abs(every.u_m) < 105) & (plan.goes_on(every.u_m) | every.across))
+
+
+def _outer_traffic(
+    rng: np.random.Generator, plan: StreetPlan, speed_m_s: float, oncoming_m_s: float
+) -> list[Placements]:
+    """Sample who drives in the outer lanes of a wide road: on our side as fast as we do, and never beside us."""
+    placements = []
+    for side in (-1, 1):
+        for lane in range(plan.outer_lanes(side)):
+            u = rng.uniform(-80, -40) + np.cumsum(_OUR_LENGTH_M + rng.exponential(_OUTER_GAP_M, 16))
+            u = u[np.abs(u) > 7.0] if side < 0 else u
+            if side > 0 and np.isfinite(plan.ends_m[0]):
+                u = u[(u > 5) & (speed_m_s > 0)]
+            v = side * plan.lane_m * (plan.lanes / 2 + 0.5 + lane)
+            turn, fast = (0.0, speed_m_s) if side < 0 else (np.pi, oncoming_m_s)
+            placements.append(Placements.of(u, v + rng.normal(0, 0.1, len(u)), turn, fast))
+    return placements
 
 
 def oncoming_speed_m_s(batches: Sequence[ObjectBatch]) -> float | None:
@@ -355,7 +311,7 @@ def traffic(
     bicycles = Placements.of(
         rng.uniform(*plan.stretch.span(40.0), count), v, rng.normal(0, 0.3, count), rise_m=plan.level_m[1]
     )
-    clear = plan.in_side_street(bicycles.u_m, bicycles.v_m, 2.0) < 0
+    clear = (plan.in_side_street(bicycles.u_m, bicycles.v_m, 2.0) < 0) & plan.goes_on(bicycles.u_m)
     if clear.any():
         groups.append(make_cyclists(rng, bicycles.select(clear), following, ridden=False))
     return groups
@@ -373,7 +329,9 @@ def _riders(rng: np.random.Generator, plan: StreetPlan) -> Placements:
         return Placements.of(_met(plan, u, np.pi, slow + 1.0), against_v_m, np.pi, slow + 1.0)
     u = rng.uniform(8, 60, count) * rng.choice([-1, 1], count)
     v = np.where(side < 0, plan.our_v_m - 0.1, against_v_m)
-    away = (side > 0) | (u > 12)
+    away = ((side > 0) | (u > 12)) & plan.goes_on(u)
+    if np.isfinite(plan.ends_m[0]):
+        away &= (side < 0) | (u > 0)
     speed_m_s = np.where(side < 0, plan.speed_m_s, slow + 1.0)
     return Placements.of(u, v, np.where(side < 0, 0.0, np.pi), speed_m_s).select(away)
 
@@ -388,7 +346,7 @@ def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:
     u = plan.stretch.around(rng, 28.0, count)
     if plan.stretch is Stretch.FIRST:
         u = np.clip(u, -80, 80)
-    keep = plan.in_side_street(u, side * across, 1.0) < 0
+    keep = (plan.in_side_street(u, side * across, 1.0) < 0) & plan.goes_on(u)
     turn = rng.choice([0.0, np.pi], count)
     if plan.stretch is not Stretch.FIRST:
         speed = np.minimum(speed, _SLOWER * plan.speed_m_s)

@@ -11,13 +11,8 @@ from lidargrit.simulator.scene import Scene, Theme, sample_attitude
 from lidargrit.simulator.scene.layout import oncoming_speed_m_s
 from lidargrit.simulator.scene.objects import ObjectBatch
 from lidargrit.simulator.scene.parts import Parts, lay_out_first, lay_out_further, lay_out_rest
-from lidargrit.simulator.scene.street_plan import (
-    SideStreet,
-    StreetPlan,
-    sample_bridge,
-    sample_further_streets,
-    sample_street_plan,
-)
+from lidargrit.simulator.scene.plan_sampling import sample_bridge, sample_further_streets, sample_street_plan
+from lidargrit.simulator.scene.street_plan import SideStreet, StreetPlan
 from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M, Stretch
 
 _KNOT_M = 2.0  # from one knot of the line to the next
@@ -154,6 +149,7 @@ class LongRoad:
             self._plan,
             side_streets=here.streets,
             bridge_u_m=here.bridge_u_m,
+            ends_m=(-np.inf, np.inf),
             line=line,
             stretch=Stretch.FURTHER,
             neighbours=bends,
@@ -169,7 +165,7 @@ class LongRoad:
             self._starts.append(_line_from(self._stream(len(self._starts) - 1), self._starts[-1])[-1])
         rng = self._stream(number)
         line = _line_from(rng, self._starts[number])
-        streets = sample_further_streets(rng, self._plan.theme)
+        streets = sample_further_streets(rng, self._plan.theme, self._plan.farthest_front_m)
         return _Sketch(line, streets, sample_bridge(rng, streets, LENGTH_M / 2 - _BRIDGE_FROM_END_M), rng)
 
     def _stream(self, number: int) -> np.random.Generator:

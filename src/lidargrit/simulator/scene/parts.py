@@ -8,7 +8,8 @@ from jaxtyping import Float
 
 from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.scene.buildings import add_houses
-from lidargrit.simulator.scene.layout import add_gardens, greenery, things, traffic
+from lidargrit.simulator.scene.greenery import greenery
+from lidargrit.simulator.scene.layout import add_gardens, things, traffic
 from lidargrit.simulator.scene.objects import ObjectBatch
 from lidargrit.simulator.scene.roads import GroundLook, PaintLook, add_bridge, add_ground, add_markings
 from lidargrit.simulator.scene.settlement import Settlement, lay_out_houses

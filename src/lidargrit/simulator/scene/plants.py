@@ -12,7 +12,8 @@ from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, leaves, sweep
 from lidargrit.simulator.scene.street_plan import StreetPlan
 
-TREES, BUSHES, HEDGES = 30, 20, 6  # shapes of each
+TREES, BUSHES, HEDGES, THICKETS = 30, 20, 6, 8  # shapes of each
+THICKET_M = 16.0  # length of a piece
 _TRUNK, _LIMBS, _LEAVES = range(3)
 _MATERIALS = (materials.BARK, materials.BARK, materials.LEAVES)
 _LABELS = (classes.TRUNK, classes.VEGETATION, classes.VEGETATION)
@@ -117,6 +118,26 @@ def hedge_shape(variant: int) -> Shape:
     return builder.build()
 
 
+@cache
+def thicket_shape(variant: int) -> Shape:
+    """Return a piece of a wood's edge seen from afar: leaves from the ground to 8 m, with a dense heart; made once."""
+    rng, builder = np.random.default_rng((77, variant)), ShapeBuilder(*_MATERIALS)
+    number, half = 2200, THICKET_M / 2
+    along = np.linspace(-half, half, 9)
+    top = np.clip(8.0 + np.cumsum(rng.normal(0, 1.2, 9)) - 1.5 * (np.abs(along) > 0.9 * half), 4.5, 10.5)
+    x = rng.uniform(-half, half, number)
+    high = np.interp(x, along, top)
+    z = high * rng.random(number) ** 0.8
+    bulge = np.sqrt(np.maximum(1 - (z / high) ** 2, 0.05)) * (1 + 0.3 * np.sin(1.3 * x + rng.uniform(0, 6)))
+    centre = np.column_stack((x, 2.4 * bulge * rng.choice([-1, 1], number) * rng.random(number) ** 0.4, z))
+    builder.add(_LEAVES, leaves(centre, rng.uniform(0.2, 0.42, number)))
+    low = np.minimum(top[1:], top[:-1]) * rng.uniform(0.35, 0.7, 8)
+    heart = boxes(np.column_stack((along[:-1], np.full((8, 2), (-0.7, -0.5)))), np.column_stack(
+        (along[1:], np.full(8, 0.7), low)))  # fmt: skip
+    builder.add(_LEAVES, heart)
+    return builder.build()
+
+
 def _batch(
     rng: np.random.Generator, shapes: list[Shape], size: np.ndarray, green: np.ndarray, placements: Placements
 ) -> ObjectBatch:
@@ -177,3 +198,15 @@ def make_hedges(
     turn = rng.integers(0, 2, len(home)) * np.pi
     placements = Placements.of(u_m[home, 0] + (order + 0.5) * step, v_m[home].mean(axis=1), turn, rise_m=rise_m)
     return _batch(rng, [hedge_shape(int(v)) for v in rng.integers(0, HEDGES, len(home))], size, green[home], placements)
+
+
+def make_thickets(
+    rng: np.random.Generator, u_m: Num[np.ndarray, " n"], v_m: Num[np.ndarray, " n"],
+    turn_rad: float | Num[np.ndarray, " n"], rise_m: float = 0.0,
+) -> ObjectBatch:  # fmt: skip
+    """Sample pieces of the edges of woods, 13 to 20 m long."""
+    count = len(u_m)
+    size = np.column_stack((rng.uniform(0.8, 1.25, count), rng.uniform(0.7, 1.5, count), rng.uniform(0.7, 1.4, count)))
+    placements = Placements.of(u_m, v_m, turn_rad, rise_m=rise_m)
+    shapes = [thicket_shape(int(v)) for v in rng.integers(0, THICKETS, count)]
+    return _batch(rng, shapes, size, rng.uniform(0.3, 0.6, count), placements)

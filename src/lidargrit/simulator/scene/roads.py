@@ -139,15 +139,16 @@ def _kinds(plan: StreetPlan, rng: np.random.Generator, bays: np.ndarray, u: np.n
     for street in plan.side_streets:
         for side in street.sides:
             beside = np.abs(u - street.u_m) < street.half_m + street.pavement_m
-            kind = np.where(beside & (v * side > 0), _PAVEMENT, kind)
+            kind = np.where(beside & (v * side > 0) & (v * side < street.end_m), _PAVEMENT, kind)
+    goes_on = plan.goes_on(u)
     for which, side in enumerate((-1, 1)):
         across = v * side
         kerb = plan.edge_m[which]
-        kind = np.where((across > kerb) & (across < kerb + plan.pavement_m[which]), _PAVEMENT, kind)
+        kind = np.where((across > kerb) & (across < kerb + plan.pavement_m[which]) & goes_on, _PAVEMENT, kind)
         parking = plan.parked[which] and bays[which]
-        kind = np.where((across >= 0) & (across < kerb), _ROAD, kind)
+        kind = np.where((across >= 0) & (across < kerb) & goes_on, _ROAD, kind)
         if parking:
-            clear = plan.in_side_street(u, v, 3.0) < 0
+            clear = (plan.in_side_street(u, v, 3.0) < 0) & goes_on
             kind = np.where((across > kerb - 2.1) & (across < kerb) & clear, _PARKING, kind)
     return np.where(plan.in_side_street(u, v) > 0, _ROAD, kind)
 
@@ -208,6 +209,7 @@ def add_markings(
     if not clear:
         return like or PaintLook(every, _PAINT_ALBEDO)
     bar = np.concatenate(clear)
+    bar = bar[plan.goes_on(bar[:, 0])]
     corners = plan.ground_points(bar[:, [0, 1, 1, 0]], bar[:, [2, 2, 3, 3]])
     corners[..., 2] += _PAINT_M
     bright = like.bright if like else rng.uniform(0.2, 0.32)  # KITTI's read .37, half as much as road again

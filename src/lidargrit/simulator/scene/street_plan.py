@@ -14,33 +14,23 @@ from lidargrit.simulator.scene.shapes import blocks
 from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M, Stretch
 
 Theme = Literal["city", "suburb", "country", "mixed"]
-_PARKING_M = 2.1  # width of a parked row
-_PARK_CHANCE = {"city": (0.65, 0.65), "suburb": (0.5, 0.5), "country": (0.0, 0.0)}  # right, left
-_LANE_M = {"city": (2.9, 3.7), "suburb": (2.7, 3.4), "country": (2.8, 3.4)}
-_PAVEMENT_M = {"city": (2.0, 4.5), "suburb": (1.2, 2.8), "country": (0.0, 0.01)}
-_SETBACK_M = {"city": (0.0, 2.5), "suburb": (1.5, 6.5), "country": (5.0, 18.0)}
-_SIDE_STREETS = {"city": 2.4, "suburb": 2.4, "country": 0.5}  # how many on average
-_WIDE_CHANCE = {"city": 0.15, "suburb": 0.06, "country": 0.0}  # of more lanes, bays across, or a strip in between
-_WIDER_M = (2.5, 9.0)
-_OPEN_CHANCE = {"city": 0.08, "suburb": 0.05, "country": 0.0}  # of a square: houses far back on one side
-_OPEN_M = (10.0, 45.0)
-_SPEED_M_S = {"city": (2.0, 11.0), "suburb": (3.0, 11.0), "country": (9.0, 22.0)}
+PARKING_M = 2.1  # width of a parked row
+_COURT_FROM_M = 11.0  # from the pavement to the houses
 _LOOKS_FOR_S = 2.0  # how long a street keeps its full detail around our car
 _VIEWPOINT_SPACING_M = 6.0  # at most, along our car's way
 _SKEW_REACH_M, _SKEW_WIDTH_M = 25.0, 25.0  # how far from our road, and from its mouth, a side street runs askew
 
-_FROM_END_M, _SKEW_FROM_END_M = 26.0, 75.0  # side streets, and those askew, to the end of their further stretch
-
 
 @dataclass(frozen=True, eq=False)
 class SideStreet:
-    """A street that leaves ours at ``u_m``; its own v axis is ours."""
+    """A street that leaves ours at ``u_m``; its own v axis is ours, and it ends ``end_m`` from the middle of ours."""
 
     u_m: float
     half_m: float
     pavement_m: float
     sides: tuple[int, ...]
     skew: float
+    end_m: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +100,7 @@ class StreetPlan:
         banks_m: rise of the ground beside the road, right and left.
         level_m: heights of pavements and of gardens or fields above the road.
         speed_m_s: speed of our own car.
+        ends_m: u at which our road ends at houses across, behind us and ahead; infinite for a road that goes on.
         stretch: kind of this stretch of the road.
         neighbours: side streets of the stretches beside this one, which bend it a little.
         place: place of a further stretch; the first one's world is the drive's.
@@ -134,6 +125,7 @@ class StreetPlan:
     banks_m: tuple[float, float]
     level_m: tuple[float, float]
     speed_m_s: float
+    ends_m: tuple[float, float] = (-np.inf, np.inf)
     stretch: Stretch = Stretch.FIRST
     neighbours: tuple[SideStreet, ...] = ()
     place: Place | None = None
@@ -168,6 +160,10 @@ class StreetPlan:
         """Side streets beside which things are still to be laid out."""
         return () if self.stretch is Stretch.REST else self.side_streets
 
+    def goes_on(self, u_m: Num[np.ndarray, "*s"]) -> Bool[np.ndarray, "*s"]:
+        """Return at which positions our road has not ended yet."""
+        return (np.asarray(u_m) > self.ends_m[0]) & (np.asarray(u_m) < self.ends_m[1])
+
     def nearest_approach_m(self, points_m: Num[np.ndarray, "n _"]) -> Float[np.ndarray, " n"]:
         """Return the smallest distance of our car from points, the same for all frames; see ``viewpoints_m``."""
         apart = points_m[:, :2] - self.viewpoints_m[:, None]
@@ -181,6 +177,22 @@ class StreetPlan:
         """Return the v of the line of houses."""
         which = (side + 1) // 2
         return side * (self.edge_m[which] + self.pavement_m[which] + self.setback_m[which])
+
+    def outer_lanes(self, side: int) -> int:
+        """Return how many lanes there are beside the inner ones on the left (side 1) or on the right (-1)."""
+        which = (side + 1) // 2
+        room_m = self.edge_m[which] - self.lane_m * self.lanes / 2 - PARKING_M * self.parked[which]
+        return max(int(room_m / self.lane_m), 0)
+
+    def court_m(self, side: int) -> float:
+        """Return the depth of the place for parked cars before houses that stand far back; 0 for none."""
+        setback_m = self.setback_m[(side + 1) // 2]
+        return min(setback_m - 4.0, 17.0) if setback_m > _COURT_FROM_M and self.theme != "country" else 0.0
+
+    @property
+    def farthest_front_m(self) -> float:
+        """Distance from the middle of the road to the farther line of houses."""
+        return max(self.front(1), -self.front(-1))
 
     def ground_points(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s 3"]:
         """Return the points of the ground, at the level of the road, at positions in the street."""
@@ -233,14 +245,18 @@ class StreetPlan:
         return blocks(corners)
 
     def in_side_street(
-        self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"], spare_m: float = 0.0
+        self,
+        u_m: Num[np.ndarray, "*s"],
+        v_m: Num[np.ndarray, "*s"],
+        spare_m: float | Float[np.ndarray, "*s"] = 0.0,
     ) -> Float[np.ndarray, "*s"]:
         """Return by how many metres points lie inside a side street (negative: outside all)."""
         inside = np.full(np.broadcast_shapes(np.shape(u_m), np.shape(v_m)), -np.inf)
         for street in self.side_streets:
             depth = street.half_m + spare_m - np.abs(np.asarray(u_m) - street.u_m)
             for side in street.sides:
-                inside = np.maximum(inside, np.where(np.asarray(v_m) * side > 0, depth, -np.inf))
+                away = np.asarray(v_m) * side
+                inside = np.maximum(inside, np.where((away > 0) & (away < street.end_m + spare_m), depth, -np.inf))
         return inside
 
     def place_of(self, point_m: Float[np.ndarray, "2"]) -> Place:
@@ -290,92 +306,3 @@ class StreetPlan:
                 beside = np.clip((side * v - self.edge_m[which] - 1.5) / 14.0, 0, 1)
                 height = height + self.banks_m[which] * beside**2 * (3 - 2 * beside)
         return height
-
-
-def sample_street_plan(rng: np.random.Generator, theme: Theme) -> StreetPlan:
-    """Sample roads and ground of one theme."""
-    kind = str(rng.choice(["suburb", "city", "country"], p=[0.52, 0.38, 0.10])) if theme == "mixed" else theme
-    lanes = 2 if kind == "country" or rng.random() < {"city": 0.8, "suburb": 0.5}[kind] else 1
-    lane = rng.uniform(*_LANE_M[kind]) * (1.0 if lanes == 2 else rng.uniform(1.25, 1.6))
-    parked = rng.random(2) < _PARK_CHANCE[kind]
-    edge = lane * lanes / 2 + np.where(parked, _PARKING_M, rng.uniform(0.15, 0.4, 2))
-    close = 0.15 if kind == "suburb" and rng.random() < 0.2 else 1.0  # streets without front gardens
-    setback = close * rng.uniform(*_SETBACK_M[kind], 2)
-    edge += np.where(rng.random(2) < _WIDE_CHANCE[kind], rng.uniform(*_WIDER_M, 2), 0.0)
-    setback += np.where(rng.random(2) < _OPEN_CHANCE[kind], rng.uniform(*_OPEN_M, 2), 0.0)
-    pavement = rng.uniform(*_PAVEMENT_M[kind], 2)
-    streets = _sample_side_streets(rng, kind)
-    bridge = sample_bridge(rng, streets)
-    wild = kind == "country"
-    return StreetPlan(
-        theme=kind,
-        lanes=lanes,
-        lane_m=lane,
-        edge_m=(float(edge[0]), float(edge[1])),
-        parked=(bool(parked[0]), bool(parked[1])),
-        pavement_m=(float(pavement[0]), float(pavement[1])),
-        setback_m=(float(setback[0]), float(setback[1])),
-        our_v_m=-lane / 2 * rng.uniform(0.7, 1.02) if lanes == 2 else rng.uniform(-0.2, 0.2),
-        side_streets=streets,
-        bridge_u_m=bridge,
-        line=_sample_line(rng, kind),
-        waves=_sample_waves(rng),
-        tilt=rng.normal(0, 0.016, 2),
-        camber=rng.uniform(0.005, 0.035),
-        banks_m=(rng.normal(0.2, 1.0), rng.normal(0.2, 1.0)) if wild else (0.0, 0.0),
-        level_m=(0.0, -0.03) if wild else (rng.uniform(0.06, 0.15), rng.uniform(0.1, 0.25)),
-        speed_m_s=0.0 if rng.random() < 0.15 else float(rng.uniform(*_SPEED_M_S[kind])),
-    )
-
-
-def sample_bridge(rng: np.random.Generator, streets: tuple[SideStreet, ...], to_m: float = 70.0) -> float:
-    """Sample where another road crosses above ours, within a distance and clear of side streets; mostly nowhere."""
-    bridge = rng.uniform(14, to_m) * rng.choice([-1, 1]) if rng.random() < 0.06 else np.inf
-    return np.inf if any(abs(street.u_m - bridge) < 22 for street in streets) else float(bridge)
-
-
-def sample_further_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
-    """Sample the side streets of a further stretch; near its ends none is askew, so that all stretches fit."""
-    streets: list[SideStreet] = []
-    for _ in range(min(rng.poisson(_SIDE_STREETS[kind] * Stretch.FURTHER.share_around(42.0)), 8)):
-        u = rng.uniform(-1, 1) * (LENGTH_M / 2 - _FROM_END_M)
-        skew = np.clip(rng.normal(0, 0.25), -0.5, 0.5) if abs(u) < LENGTH_M / 2 - _SKEW_FROM_END_M else 0.0
-        sides = ((-1, 1), (1,), (-1,))[rng.choice(3, p=[0.4, 0.3, 0.3])]
-        half, pavement = rng.uniform(2.3, 4.0), 0.0 if kind == "country" else rng.uniform(1.0, 2.2)
-        if all(abs(u - other.u_m) > 32 for other in streets):
-            streets.append(SideStreet(u, half, pavement, sides, float(skew)))
-    return tuple(streets)
-
-
-def _sample_side_streets(rng: np.random.Generator, kind: str) -> tuple[SideStreet, ...]:
-    streets: list[SideStreet] = []
-    for _ in range(min(rng.poisson(_SIDE_STREETS[kind]), 4)):
-        u, skew = rng.normal(0, 42), float(np.clip(rng.normal(0, 0.25), -0.5, 0.5))
-        sides = ((-1, 1), (1,), (-1,))[rng.choice(3, p=[0.4, 0.3, 0.3])]
-        half, pavement = rng.uniform(2.3, 4.0), 0.0 if kind == "country" else rng.uniform(1.0, 2.2)
-        if abs(u) < 95 and all(abs(u - other.u_m) > 32 for other in streets):
-            streets.append(SideStreet(float(u), half, pavement, sides, skew))
-    return tuple(streets)
-
-
-def _sample_line(rng: np.random.Generator, kind: str) -> np.ndarray:
-    """Sample a gentle arc, in most streets with a bend or two."""
-    u = np.arange(-260.0, 261.0, 2.0)
-    yaw = rng.normal(0, 0.0012) * u
-    for side in (-1, 1):
-        if rng.random() < (0.6 if kind != "country" else 0.7):
-            at, length = side * rng.uniform(22, 85), rng.uniform(10, 25)
-            yaw += rng.uniform(-0.75, 0.75) * (np.tanh((u - at) / length) + side)
-    middle = (yaw[1:] + yaw[:-1]) / 2
-    steps = np.stack((np.cos(middle), np.sin(middle)), axis=1) * 2.0
-    xy = np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
-    xy -= xy[len(u) // 2]
-    return np.column_stack((u, xy, np.cos(yaw), np.sin(yaw)))
-
-
-def _sample_waves(rng: np.random.Generator) -> np.ndarray:
-    """Sample waves of the ground whose slopes have a spread of about one in sixty each."""
-    length, turn = np.exp(rng.uniform(np.log(45), np.log(260), 4)), rng.uniform(0, 2 * np.pi, 4)
-    number = 2 * np.pi / length
-    amplitude = rng.normal(0, 0.016, 4) / number
-    return np.column_stack((amplitude, number * np.cos(turn), number * np.sin(turn), rng.uniform(0, 2 * np.pi, 4)))
