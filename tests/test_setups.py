@@ -191,7 +191,7 @@ def test_scans_tell_the_set_up_that_made_them():
     setup = SensorSetup(
         range_sigma_m=0.015, offset_m=tuple(offset_m), reading=tuple(reading), height_m=2.0, reflectance_scale=0.5
     )
-    scans = [simulate(seed, replace(SENSOR, setup=setup)) for seed in range(3)]
+    scans = [simulate(seed, replace(SENSOR, setup=setup)) for seed in range(4)]
     fit = fit_sensor(scans)
     found = fit.sensor.setup
     assert found is not None

@@ -37,7 +37,7 @@ ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOT
 # Plaster and brick were then made brighter by .15, until the reflectance of all scans together was as near as before:
 # in labelled scans walls read brighter than roads (.42 and .25).
 # Contrasts, and with them the same materials' diffuse, are set by hand: ground reads .22 to .31 in nearly all scans of
-# KITTI, half of what the albedos of streets spread; cars read 0 or .2 to .4, and seldom a number between.
+# KITTI, half of what the albedos of streets spread; cars read 0 or .2 to .4, so bright paint scatters as plaster does.
 # Mottle is set so that readings of one class spread as in labelled scans.
 # The other numbers are set by eye: bodies of cars fade out in rows, their windows are dark.
 MATERIALS: tuple[Material, ...] = (
@@ -46,7 +46,7 @@ MATERIALS: tuple[Material, ...] = (
     Material("plaster", diffuse=0.82, mottle=0.1),
     Material("brick", diffuse=1.17, mottle=0.12),
     Material("metal", gloss=0.966, lobe_power=30.0),
-    Material("paint", diffuse=1.25, contrast=1.4, gloss=1.36, lobe_power=45.6),
+    Material("paint", diffuse=1.0, gloss=1.36, lobe_power=45.6),
     # Clear glass would pass 0.9; that of cars and houses is made to keep heat out, which begins at this wavelength.
     Material("glass", diffuse=0.0093, gloss=0.00258, lobe_power=40.0, passes=0.2),
     Material("foil", retroreflection=32.4),

@@ -22,7 +22,8 @@ _DEEP_M = np.array([0.14, 0.14, 0.05, 0.2, 0.25, 0.8])  # of each kind behind th
 _SILLS_TO_M = 22.0  # a sill stands out by less than a beam is wide, farther away
 _CURTAINED = 0.45  # share of the panes
 _SHUT = 0.6, 1.0  # shares of a house's windows with a blind or a board, at least and at most
-_OPAQUE_ALBEDO = 0.3, 0.65  # of that, and of doors
+_OPAQUE_ALBEDO = 0.3, 0.65  # of that
+_DARKER = np.array([1.0, 1.0, 1.0, 0.6, 0.6, 1.0])  # of each kind: doors are darker
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +263,7 @@ def _add_patches(
     along, z = hole[:, [0, 1, 1, 0]], hole[:, [2, 2, 3, 3]]
     points = _on_wall(houses, walls, wall, along, np.full(along.shape, -0.03), z)
     room = np.where(rng.random(len(kind)) < _CURTAINED, rng.uniform(0.25, 0.6, len(kind)), 0.09)
-    bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(*_OPAQUE_ALBEDO, len(kind)))
+    bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(*_OPAQUE_ALBEDO, len(kind)) * _DARKER[kind])
     material = np.where(np.isin(kind, (_DOOR, _GARAGE)), materials.PAINT, materials.PLASTER)
     builder.add(quads(points), material[:, None], bright[:, None], classes.BUILDING)
 
@@ -292,7 +293,7 @@ def _add_cells(
     material, albedo = houses.wall_material[house][:, None, None], houses.wall_albedo[house][:, None, None]
     builder.add(quads(reveal), material, albedo, classes.BUILDING)
     filling = np.array([materials.GLASS, *(materials.PLASTER,) * 2, *(materials.PAINT,) * 2, materials.PLASTER])[kind]
-    opaque = rng.uniform(*_OPAQUE_ALBEDO, len(kind))
+    opaque = rng.uniform(*_OPAQUE_ALBEDO, len(kind)) * _DARKER[kind]
     bright = np.where(kind == _PANE, 0.02, np.where(kind == _GATEWAY, 0.05, opaque))
     builder.add(quads(inner), filling[:, None], bright[:, None], classes.BUILDING)
     curtain = np.flatnonzero((kind == _PANE) & (rng.random(len(kind)) < _CURTAINED))  # cloth close behind the pane

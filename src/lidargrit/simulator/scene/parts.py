@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.scene.buildings import add_houses
+from lidargrit.simulator.scene.clutter import clutter
 from lidargrit.simulator.scene.layout import add_gardens, greenery, things, traffic
 from lidargrit.simulator.scene.objects import ObjectBatch
 from lidargrit.simulator.scene.roads import GroundLook, PaintLook, add_bridge, add_ground, add_markings
@@ -103,7 +104,12 @@ def _furnished(
     oncoming_m_s: float = 0.0,
     first_instance: int = 1,
 ) -> Parts:
-    batches = [*add_gardens(builder, rng, plan, town), *greenery(rng, plan, town), things(rng, plan)]
+    batches = [
+        *add_gardens(builder, rng, plan, town),
+        *greenery(rng, plan, town),
+        things(rng, plan),
+        clutter(rng, plan),
+    ]
     still, moving = [batch.at(plan) for batch in batches], []
     for batch in traffic(rng, plan, town, oncoming_m_s, first_instance):
         stands, goes = batch.split()
