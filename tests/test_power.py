@@ -69,8 +69,9 @@ def test_surfaces_answer_by_their_material():
     assert brightness(materials.PLASTER, 0.4, 0.5) == pytest.approx(0.2 * plaster)  # Lambert's law
     paint = materials.MATERIALS[materials.PAINT]
     square, oblique = (brightness(materials.PAINT, 0.1, cos) for cos in (1.0, 0.7))
-    assert square == pytest.approx(0.1 * paint.diffuse + paint.gloss)
-    assert oblique == pytest.approx(0.07 * paint.diffuse, rel=0.01)  # beside the lobe
+    scattered = paint.diffuse * 0.1**paint.contrast
+    assert square == pytest.approx(scattered + paint.gloss)
+    assert oblique == pytest.approx(0.7 * scattered, rel=0.01)  # beside the lobe
     assert brightness(materials.FOIL, 0.5, 0.7) > 5 * brightness(materials.PLASTER, 0.5, 0.7)
     assert brightness(materials.PAINT, 0.1, 1.0, replace(MODEL, gloss=2.0)) == pytest.approx(square + paint.gloss)
     assert Surfaces.of(road(), MODEL, SETUP).brightness(np.int32([-1]), np.float32([0.0]))[0] == 0
@@ -78,7 +79,8 @@ def test_surfaces_answer_by_their_material():
 
 def test_wet_ground_is_darker_but_for_a_mirror_like_lobe():
     for material in (materials.ASPHALT, materials.CONCRETE):
-        soaked = 0.3 * materials.MATERIALS[material].diffuse * (1 - MODEL.wet_darkening)
+        ground = materials.MATERIALS[material]
+        soaked = ground.diffuse * 0.3**ground.contrast * (1 - MODEL.wet_darkening)
         assert brightness(material, 0.3, 0.3, wet=1.0) == pytest.approx(0.3 * soaked, rel=1e-3)
         assert brightness(material, 0.3, 1.0, wet=1.0) == pytest.approx(soaked + MODEL.wet_gloss, rel=1e-3)
     assert brightness(materials.PLASTER, 0.3, 0.3, wet=1.0) == brightness(materials.PLASTER, 0.3, 0.3)
@@ -246,7 +248,8 @@ def test_nothing_is_met_beyond_the_reach():
 
 def test_reflectance_follows_albedo_until_the_echo_is_weak():
     def reads(scattered, level, chance=0.0, specular=0.0):
-        return float(reflectance(*(np.float32([v]) for v in (scattered, specular, level, chance)), MODEL)[0])
+        given = (np.float32([v]) for v in (scattered, specular, level, chance, 10.0))
+        return float(reflectance(*given, MODEL, SensorSetup())[0])
 
     assert reads(0.3, 5) == pytest.approx(0.3)
     assert reads(0.6, 5) == pytest.approx(0.6)
@@ -258,9 +261,10 @@ def test_reflectance_follows_albedo_until_the_echo_is_weak():
     assert reads(0.5, 5, specular=3.0) == pytest.approx(0.99)
     scene = look(ToyScene(road(), wall(20.0, 0.6)))
     near = scene.return_mask & (scene.clean_range_m < 22) & (scene.cos_incidence > 0.1)
-    asphalt, plaster = (materials.MATERIALS[m].diffuse for m in (materials.ASPHALT, materials.PLASTER))
+    asphalt, plaster = (materials.MATERIALS[m] for m in (materials.ASPHALT, materials.PLASTER))
     means = [scene.reflectance[near & (scene.label == label)].mean() for label in (classes.ROAD, classes.BUILDING)]
-    assert means == pytest.approx([0.26 * asphalt, 0.6 * plaster], abs=0.06)
+    wanted = [asphalt.diffuse * 0.26**asphalt.contrast, plaster.diffuse * 0.6]
+    assert means == pytest.approx(wanted, abs=0.06)
 
 
 def test_boxes_have_their_own_class_and_number():

@@ -239,7 +239,7 @@ def _measure(
     scattered = (scattered.reshape(shape) * lasers.reading).ravel()
     # The very pulse that comes back stronger reads brighter.
     chance = beam_noise.pulse.ravel() * surfaces.mottle[surfaces.material[echoes.triangle]]
-    bright = reflectance(scattered, specular, level + pulse_noise, chance, model, setup.reflectance_scale)
+    bright = reflectance(scattered, specular, level + pulse_noise, chance, echoes.range_m, model, setup)
     return Observation(
         clean_range_m=np.where(np.isinf(echoes.range_m), np.float32(0), echoes.range_m).reshape(shape),
         return_probability=probability.reshape(shape),

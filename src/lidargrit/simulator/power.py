@@ -12,6 +12,7 @@ from lidargrit.simulator.materials import ASPHALT, CONCRETE, GLASS, MATERIALS, M
 from lidargrit.simulator.mesh import Finish
 
 _PATCH_AT_LEAST_DEG = 0.01  # finer than any sensor's columns; every patch of a ring takes memory
+_READING_STEP = 0.02  # of the frequencies of readings
 _INCIDENCE_AT_LEAST = 0.05  # cosine: beyond 87 degrees a beam's footprint ends with the surface
 
 
@@ -60,9 +61,9 @@ class RaydropModel:
     object_spread: float = 0.522
     pulse_spread: float = 0.424
     edge_share: float = 0.05
-    dim_level: float = 2.67
+    dim_level: float = 2.4
     dim_share: float = 0.175
-    bright_level: float = 3.1
+    bright_level: float = 3.4
     reflectance_spread: float = 0.08
     wet_darkening: float = 0.5
     wet_gloss: float = 0.02
@@ -109,10 +110,13 @@ class Surfaces:
         albedo = np.append(finish.albedo, np.float32(0))
         material = np.append(finish.material, np.uint8(len(model.materials)))
         nothing = Material("nothing")
-        diffuse, gloss, lobe_power, retro, passes, mottle = (
+        diffuse, contrast, gloss, lobe_power, retro, passes, mottle = (
             np.array([getattr(m, name) for m in (*model.materials, nothing)], np.float32)
-            for name in ("diffuse", "gloss", "lobe_power", "retroreflection", "passes", "mottle")
+            for name in ("diffuse", "contrast", "gloss", "lobe_power", "retroreflection", "passes", "mottle")
         )
+        for index in np.flatnonzero(contrast != 1):
+            of = material == index
+            albedo[of] **= contrast[index]
         albedo *= diffuse[material]
         gloss, retro = gloss * np.float32(model.gloss), retro * np.float32(model.retroreflection)
         if wet:
@@ -264,22 +268,45 @@ def reflectance(
     specular: Float32[np.ndarray, "*shape"],
     level: Float32[np.ndarray, "*shape"],
     chance: Float32[np.ndarray, "*shape"],
+    range_m: Float32[np.ndarray, "*shape"],
     model: RaydropModel,
-    scale: float = 1.0,
+    setup: SensorSetup,
 ) -> Float32[np.ndarray, "*shape"]:
-    """Return what the sensor reports as reflectance: hundredths in [0, 0.99], or finer where its scale is below 1.
+    """Return what the sensor reports as reflectance: hundredths in [0, 0.99]; where its scale is below 1, 255ths.
 
-    A sensor undoes range and incidence from the strength of the echo, but a weak echo reads too dark: KITTI's road
-    reads alike up to 17 m and falls to 0 at 30 m, though it is seen to 55 m.
+    A sensor undoes range and incidence from the strength of the echo, but an HDL-64E does so to some 18 m only: beyond,
+    walls and leaves fade with range, and its weak echoes read 0, as KITTI's road does at 30 m though it is seen to
+    55 m. A Pandar64 reads alike at all ranges.
 
     Args:
         scattered: share of light that the surface scatters evenly.
         specular: light that the surface sends back besides, by gloss and retroreflection.
         level: natural log of power over the least power.
         chance: relative error of this reading.
-        scale: factor by which this sensor's maker scales reflectances.
+        range_m: range of the echo.
+        setup: scale and contrast of this sensor's reflectances, and how they fade.
     """
-    full = np.float32(scale) * (scattered * (1 + chance) + np.float32(0.5) * specular)
+    full = np.maximum(scattered * (1 + chance) + np.float32(0.5) * specular, 0)
+    if setup.reflectance_power != 1:
+        full **= np.float32(setup.reflectance_power)
+    full *= np.float32(setup.reflectance_scale)
     seen = (level - np.float32(model.dim_level)) * np.float32(1 / (model.bright_level - model.dim_level))
     dimmed = np.where(seen > 0, model.dim_share + (1 - model.dim_share) * np.minimum(seen, 1), 0).astype(np.float32)
-    return np.round(np.clip(full * dimmed, 0, 0.99), 2 if scale >= 1 else 3)
+    if setup.weak_dimming < 1:
+        dimmed = 1 - np.float32(setup.weak_dimming) * (1 - dimmed)
+    full *= dimmed
+    if setup.reading_frequency:
+        full = _as_read(full, setup.reading_frequency)
+    if setup.fades_to_m:
+        faded = (np.float32(setup.fades_to_m) - range_m) * np.float32(1 / (setup.fades_to_m - setup.fades_from_m))
+        full *= np.clip(faded, 0, 1)
+    most, steps = (0.99, 100) if setup.reflectance_scale >= 1 else (1.0, 255)
+    return np.round(np.clip(full, 0, most) * np.float32(steps)) * np.float32(1 / steps)
+
+
+def _as_read(reflectance: Float32[np.ndarray, "*shape"], frequency: tuple[float, ...]) -> Float32[np.ndarray, "*shape"]:
+    """Move readings towards those that a sensor prefers; the last of the steps, and what is above them, stays."""
+    step_ends = _READING_STEP * np.arange(len(frequency) + 1)
+    reached = np.cumsum((0.0, *frequency))
+    read = np.interp(reflectance, reached * (step_ends[-1] / reached[-1]), step_ends)
+    return np.where(reflectance < step_ends[-1], read, reflectance).astype(np.float32)

@@ -17,10 +17,13 @@ _WINDOWS_TO_M = 85.0  # a window farther away is hit by a beam or two
 _OCCLUDERS_TO_M = 55.0  # houses farther away hide little that is not far itself
 _HIDDEN_M = 90.0  # what houses hide is placed as if it were so far away: hardly a beam finds it
 _THROUGH_PANE = materials.MATERIALS[materials.GLASS].passes ** 2  # share of light that comes back from behind one
-_PANE, _SHUTTER, _DOOR, _GARAGE, _GATEWAY = range(5)
-_DEEP_M = np.array([0.14, 0.05, 0.2, 0.25, 0.8])  # of each kind behind the face of the wall
+_PANE, _BLIND, _SHUTTER, _DOOR, _GARAGE, _GATEWAY = range(6)
+_DEEP_M = np.array([0.14, 0.14, 0.05, 0.2, 0.25, 0.8])  # of each kind behind the face of the wall
 _SILLS_TO_M = 22.0  # a sill stands out by less than a beam is wide, farther away
 _CURTAINED = 0.45  # share of the panes
+_SHUT = 0.6, 1.0  # shares of a house's windows with a blind or a board, at least and at most
+_OPAQUE_ALBEDO = 0.3, 0.65  # of that
+_DARKER = np.array([1.0, 1.0, 1.0, 0.6, 0.6, 1.0])  # of each kind: doors are darker
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +173,9 @@ def _add_windows(builder: MeshBuilder, rng: np.random.Generator, houses: Houses,
     chance = rng.random(len(cell))
     shop = (storey == 0) & (houses.storey_m[home] > 3.3) & (style[0] > 0.4)  # tall ground floors have large panes
     half_width, sill = np.where(shop, width * 0.42, half_width), np.where(shop, 0.4, sill)
-    kind = np.where(chance < 0.16, _SHUTTER, _PANE)
+    # Habits of a house: of KITTI's labelled walls 2 % read 0, so behind most windows that it sees are blinds or boards.
+    shut = ~shop & (rng.random(len(cell)) < rng.uniform(*_SHUT, len(houses.length_m))[home])
+    kind = np.where(chance < 0.16, _SHUTTER, np.where(shut, _BLIND, _PANE))
     ground, grand = storey == 0, (width > 2.5) & (houses.length_m[home] > 6)
     entry = rng.random(len(cell))
     door, garage = ground & (entry < 0.13) & ~shop, ground & grand & (entry > 0.93)
@@ -258,7 +263,7 @@ def _add_patches(
     along, z = hole[:, [0, 1, 1, 0]], hole[:, [2, 2, 3, 3]]
     points = _on_wall(houses, walls, wall, along, np.full(along.shape, -0.03), z)
     room = np.where(rng.random(len(kind)) < _CURTAINED, rng.uniform(0.25, 0.6, len(kind)), 0.09)
-    bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(0.15, 0.55, len(kind)))
+    bright = np.where(kind == _PANE, room * _THROUGH_PANE, rng.uniform(*_OPAQUE_ALBEDO, len(kind)) * _DARKER[kind])
     material = np.where(np.isin(kind, (_DOOR, _GARAGE)), materials.PAINT, materials.PLASTER)
     builder.add(quads(points), material[:, None], bright[:, None], classes.BUILDING)
 
@@ -287,8 +292,9 @@ def _add_cells(
     reveal = np.stack((outer, np.roll(outer, -1, 1), np.roll(inner, -1, 1), inner), axis=2)
     material, albedo = houses.wall_material[house][:, None, None], houses.wall_albedo[house][:, None, None]
     builder.add(quads(reveal), material, albedo, classes.BUILDING)
-    filling = np.array([materials.GLASS, materials.PLASTER, *(materials.PAINT,) * 2, materials.PLASTER])[kind]
-    bright = np.where(kind == _PANE, 0.02, np.where(kind == _GATEWAY, 0.05, rng.uniform(0.15, 0.55, len(kind))))
+    filling = np.array([materials.GLASS, *(materials.PLASTER,) * 2, *(materials.PAINT,) * 2, materials.PLASTER])[kind]
+    opaque = rng.uniform(*_OPAQUE_ALBEDO, len(kind)) * _DARKER[kind]
+    bright = np.where(kind == _PANE, 0.02, np.where(kind == _GATEWAY, 0.05, opaque))
     builder.add(quads(inner), filling[:, None], bright[:, None], classes.BUILDING)
     curtain = np.flatnonzero((kind == _PANE) & (rng.random(len(kind)) < _CURTAINED))  # cloth close behind the pane
     along, z = along[curtain], z[curtain]

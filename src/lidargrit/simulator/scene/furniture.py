@@ -12,12 +12,13 @@ from lidargrit.simulator.mesh import Shape
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, fans, lathe, leaves, loft, sweep
 
-_POLE, _FACE, _BACK, _BODY, _STONE, _GREEN, _PANE = range(7)
+_POLE, _FACE, _BACK, _BODY, _STONE, _GREEN, _PANE, _BOARD, _RAIL = range(9)
 _MATERIALS = (materials.METAL, materials.FOIL, materials.METAL, materials.PAINT, materials.CONCRETE, materials.LEAVES,
-              materials.GLASS)  # fmt: skip
+              materials.GLASS, materials.BARK, materials.METAL)  # fmt: skip
 _LABELS = (classes.POLE, classes.TRAFFIC_SIGN, classes.TRAFFIC_SIGN, *(classes.OTHER_OBJECT,) * 2, classes.VEGETATION,
-           classes.OTHER_OBJECT)  # fmt: skip
+           classes.OTHER_OBJECT, *(classes.FENCE,) * 2)  # fmt: skip
 VARIANTS = 8
+HOARDING_M, RAILING_M, SCAFFOLD_M = 6.0, 4.0, 5.0  # lengths of pieces, along x
 
 
 def _mast(builder: ShapeBuilder, tall: float, radius: float, taper: float = 0.6, y: float = 0.0) -> None:
@@ -150,9 +151,96 @@ def _meter(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     builder.add(_BODY, boxes(np.array([-0.16, -0.2, 1.0]), np.array([0.12, 0.2, 1.0 + high])))
 
 
-LAMP, SIGN, GUIDE, SIGNAL, BIN, CABINET, BENCH, PLANTER, COLUMN, SHELTER, BOLLARD, METER = range(12)
+def _hoarding(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """A piece of the boards around a building site, or of a fence of bars on feet of concrete."""
+    half, tall = HOARDING_M / 2, rng.uniform(1.8, 2.3)
+    if rng.random() < 0.6:
+        for x in np.arange(-half, half, HOARDING_M / 4):  # boards stand a little before and behind one another
+            deep = rng.uniform(0.0, 0.04)
+            low, high = np.array([x, deep - 0.03, 0.05]), np.array([x + HOARDING_M / 4, deep + 0.03, tall])
+            builder.add(_BOARD, boxes(low, high))
+        return
+    for x in np.linspace(-half, half, 40):
+        builder.add(_RAIL, boxes(np.array([x - 0.012, -0.012, 0.15]), np.array([x + 0.012, 0.012, tall])))
+    for x in (-half, 0.0, half):
+        builder.add(_STONE, boxes(np.array([x - 0.12, -0.35, -0.05]), np.array([x + 0.12, 0.35, 0.14])))
+    for z in (0.15, tall - 0.05):
+        builder.add(_RAIL, boxes(np.array([-half, -0.02, z]), np.array([half, 0.02, z + 0.04])))
+
+
+def _railing(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """A piece of the railing between pavement and road."""
+    half, tall = RAILING_M / 2, rng.uniform(0.95, 1.1)
+    for x in np.linspace(-half, half, int(rng.choice([3, 17]))):
+        wide = 0.03 if abs(abs(x) - half) < 0.01 or not x else 0.012
+        builder.add(_RAIL, boxes(np.array([x - wide, -wide, -0.1]), np.array([x + wide, wide, tall])))
+    for z in (0.12, tall / 2, tall):
+        builder.add(_RAIL, boxes(np.array([-half, -0.025, z - 0.03]), np.array([half, 0.025, z + 0.03])))
+
+
+def _scaffold(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """A piece of a scaffold before a front: tubes, planks, at times a net."""
+    half, storeys = SCAFFOLD_M / 2, int(rng.integers(2, 6))
+    tall = 2.0 * storeys + 1.0
+    for x in (-half, 0.0, half):
+        for y in (-0.4, 0.4):
+            builder.add(_POLE, boxes(np.array([x - 0.03, y - 0.03, -0.2]), np.array([x + 0.03, y + 0.03, tall])))
+    for z in 2.0 * np.arange(1, storeys + 1) + 0.2:
+        builder.add(_BODY, boxes(np.array([-half, -0.4, z]), np.array([half, 0.4, z + 0.05])))
+        for rail in (0.5, 1.0):
+            for y in (-0.4, 0.4):
+                low, high = np.array([-half, y - 0.025, z + rail]), np.array([half, y + 0.025, z + rail + 0.05])
+                builder.add(_POLE, boxes(low, high))
+
+
+def _stall(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """A stall or kiosk that is open along -y: a counter, a back and a roof that overhangs."""
+    half, deep, tall = rng.uniform(1.0, 1.8), rng.uniform(0.6, 1.0), rng.uniform(2.3, 2.7)
+    builder.add(_BODY, boxes(np.array([-half, -deep, 0.0]), np.array([half, -deep + 0.5, 0.95])))
+    builder.add(_BODY, boxes(np.array([-half, deep - 0.06, 0.0]), np.array([half, deep, tall])))
+    builder.add(
+        _BODY, boxes(np.array([-half - 0.2, -deep - 0.5, tall]), np.array([half + 0.2, deep + 0.1, tall + 0.1]))
+    )
+    for x in (-half, half):
+        builder.add(_POLE, boxes(np.array([x - 0.04, -deep, 0.0]), np.array([x + 0.04, -deep + 0.08, tall])))
+
+
+def _box(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """A skip, a container for glass, a toilet hut or a pile of crates: a body that widens upwards, with a rim."""
+    length, wide, tall = rng.choice(
+        [(1.8, 0.9, 1.3), (0.75, 0.75, 1.7), (0.55, 0.55, 2.2), (0.6, 0.4, 1.2)]
+    ) * rng.uniform(0.9, 1.1, 3)
+    corner = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    slope = rng.uniform(0.8, 1.0)
+    outline = ((slope, 0.0), (1.0, tall - 0.12), (1.05, tall - 0.12), (1.05, tall))
+    rings = np.array([[(length * grow * a, wide * grow * b, z) for a, b in corner] for grow, z in outline])
+    builder.add(_BODY, loft(rings[None]))
+    builder.add(_BODY, fans(rings[-1]))
+
+
+def _bed(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """A low wall, or a raised bed with shrubs."""
+    half, wide, tall = rng.uniform(1.2, 3.5), rng.uniform(0.15, 0.6), rng.uniform(0.4, 0.9)
+    builder.add(_STONE, boxes(np.array([-half, -wide, -0.2]), np.array([half, wide, tall])))
+    if wide > 0.3:
+        number = int(160 * half)
+        way = rng.uniform(-1, 1, (number, 3)) * np.array([half, wide, 0.3]) + np.array([0, 0, tall + 0.3])
+        builder.add(_GREEN, leaves(way, rng.uniform(0.04, 0.09, number)))
+
+
+def _rack(builder: ShapeBuilder, rng: np.random.Generator) -> None:
+    """Stands to which bicycles are locked, in a row along y."""
+    for y in np.arange(int(rng.integers(3, 8))) * 0.9:
+        for low, high in ((-0.38, -0.33), (0.33, 0.38)):
+            builder.add(_POLE, boxes(np.array([low, y - 0.025, -0.1]), np.array([high, y + 0.025, 0.8])))
+        builder.add(_POLE, boxes(np.array([-0.38, y - 0.025, 0.8]), np.array([0.38, y + 0.025, 0.85])))
+
+
+(LAMP, SIGN, GUIDE, SIGNAL, BIN, CABINET, BENCH, PLANTER, COLUMN, SHELTER, BOLLARD, METER, HOARDING, RAILING, SCAFFOLD,
+ STALL, BOX, BED, RACK) = range(19)  # fmt: skip
 _MAKERS: tuple[Callable[[ShapeBuilder, np.random.Generator], None], ...] = (
-    _lamp, _sign, _guide, _signal, _bin, _cabinet, _bench, _planter, _column, _shelter, _bollard, _meter,
+    _lamp, _sign, _guide, _signal, _bin, _cabinet, _bench, _planter, _column, _shelter, _bollard, _meter, _hoarding,
+    _railing, _scaffold, _stall, _box, _bed, _rack,
 )  # fmt: skip
 
 
@@ -172,5 +260,6 @@ def make_furniture(
     shapes = [furniture_shape(int(kind), int(variant)) for kind, variant in zip(kinds, variants, strict=True)]
     albedo = np.column_stack((rng.uniform(0.08, 0.3, count), np.full(count, 0.5), np.full(count, 0.3),
                               rng.uniform(0.04, 0.5, count), rng.uniform(0.2, 0.4, count),
-                              rng.uniform(0.3, 0.6, count), np.full(count, 0.02)))  # fmt: skip
+                              rng.uniform(0.3, 0.6, count), np.full(count, 0.02), rng.uniform(0.2, 0.6, count),
+                              rng.uniform(0.08, 0.4, count)))  # fmt: skip
     return ObjectBatch.standing(shapes, np.ones((count, 3)), albedo, _LABELS, placements)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.scene.buildings import add_houses
+from lidargrit.simulator.scene.clutter import clutter
 from lidargrit.simulator.scene.greenery import greenery
 from lidargrit.simulator.scene.layout import add_gardens, things, traffic
 from lidargrit.simulator.scene.objects import ObjectBatch
@@ -104,7 +105,12 @@ def _furnished(
     oncoming_m_s: float = 0.0,
     first_instance: int = 1,
 ) -> Parts:
-    batches = [*add_gardens(builder, rng, plan, town), *greenery(rng, plan, town), things(rng, plan)]
+    batches = [
+        *add_gardens(builder, rng, plan, town),
+        *greenery(rng, plan, town),
+        things(rng, plan),
+        clutter(rng, plan),
+    ]
     still, moving = [batch.at(plan) for batch in batches], []
     for batch in traffic(rng, plan, town, oncoming_m_s, first_instance):
         stands, goes = batch.split()
