@@ -41,7 +41,7 @@ class SensorSetup(Settings):
         reflectance_power: exponent of all reflectances before that factor: 1 for the units of the materials, in which
             KITTI's HDL-64E reads; above 1 for makers whose scale has more contrast.
         weak_dimming: share by which weak echoes read too dark: 1 as those of an HDL-64E, which fall to 0; 0 for none.
-        reading_frequency: how often each reading occurs, in steps of .02 from 0, relative to one that reads evenly;
+        reading_frequency: frequency of each reading, in steps of .02 from 0, relative to one that reads evenly;
             none for such a sensor. Some electronics prefer some numbers.
         fades_from_m: range from which reflectances read too dark, growing evenly until they read 0 at ``fades_to_m``.
         fades_to_m: range from which all reflectances read 0; 0 for sensors whose readings do not fade.
