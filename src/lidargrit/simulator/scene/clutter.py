@@ -71,9 +71,10 @@ def _row(
 
 
 def _clear(plan: StreetPlan, u_m: Num[np.ndarray, " n"], v_m: Num[np.ndarray, " n"]) -> np.ndarray:
-    """Return which places are clear of side streets, of the bridge, and of the stretch's end."""
+    """Return which places are clear of side streets, of the bridge, and of the end of the stretch or road."""
     return (
         (plan.in_side_street(u_m, v_m, 3.0) < 0)
+        & plan.goes_on(u_m)
         & (np.abs(u_m - plan.bridge_u_m) > 14.0)
         & (u_m < plan.stretch.half_m - HOARDING_M / 2)
     )
