@@ -47,6 +47,7 @@ def look(*parts, columns=SENSOR.width, **setup):
         ({"weak_dimming": 1.5}, "got weak_dimming=1.5"),
         ({"reading_frequency": (1.0, 0.0)}, "got reading_frequency="),
         ({"fades_to_m": -1.0}, "got fades_to_m=-1"),
+        ({"fades_from_m": 60.0, "fades_to_m": 20.0}, "got fades_from_m=60, fades_to_m=20; wanted a range that is farther"),
     ],
 )
 def test_numbers_out_of_bounds_are_refused(change, message):

@@ -39,10 +39,10 @@ class RaydropModel:
         object_spread: spread of the log gain from object to object. Fitted.
         pulse_spread: spread of the log gain from pulse to pulse. Fitted.
         edge_share: relative bend of inverse range above which a pixel counts as an edge; a plane has no bend.
-        dim_level: log of power over ``least_power`` below which reflectance reads 0. Fitted.
+        dim_level: log of power over ``least_power`` below which reflectance reads 0. Set by hand.
         dim_share: share of its reflectance that an echo just above that level reads; KITTI has few readings in
             (0, 0.05). Fitted.
-        bright_level: log of power over ``least_power`` above which reflectance reads in full. Fitted.
+        bright_level: log of power over ``least_power`` above which reflectance reads in full. Set by hand.
         reflectance_spread: relative spread of reflectance from pulse to pulse, besides its material's. Set by hand:
             with it neighbouring readings of near ground differ as in KITTI, by 0.12.
         wet_darkening: share of scattered light that soaked asphalt or concrete loses. Assumed: about half, because

@@ -68,6 +68,12 @@ class SensorSetup(Settings):
     fades_to_m: Annotated[float, Bounds(0, 1000)] = 0.0
     height_m: Annotated[float, Bounds(0.1, 10)] = 1.73
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.fades_to_m <= self.fades_from_m:
+            got = f"fades_from_m={self.fades_from_m:g}, fades_to_m={self.fades_to_m:g}"
+            raise ConfigError(got, "a range that is farther to fade to", "give one, or 0 for readings that do not fade")
+
     def check_rows(self, name: str, height: int) -> None:
         """Refuse lists of lasers that are not as long as a sensor has rows."""
         for what in ("offset_m", "log_gain", "reading"):
