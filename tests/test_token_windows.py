@@ -134,11 +134,14 @@ def small_system(columns=512):
     return LidarGrit(replace(preset.model, pixels=None), preset.data.load_sensor())
 
 
+def two_images(sensor):
+    range_m = 5 + 20 * torch.rand((2, sensor.height, sensor.width), generator=torch.Generator().manual_seed(0))
+    return RangeImage.masked(range_m, range_m < 22, sensor)
+
+
 def test_training_learns_windows_and_validation_the_whole_scan():
     generator = small_system()
-    sensor = generator.sensor
-    range_m = 5 + 20 * torch.rand((2, sensor.height, sensor.width), generator=torch.Generator().manual_seed(0))
-    images = RangeImage.masked(range_m, range_m < 22, sensor)
+    images = two_images(generator.sensor)
     objective, rng = generator.transformer_objective(), torch.Generator().manual_seed(0)
     objective.train()
     terms = objective(Example(images), rng)
@@ -154,9 +157,7 @@ def test_training_learns_windows_and_validation_the_whole_scan():
 def test_a_training_reads_as_many_windows_of_each_scan_as_are_asked_for_and_counts_each_alike():
     generator = small_system()
     generator.transformer.config = replace(generator.transformer.config, windows_per_scan=3)
-    sensor = generator.sensor
-    range_m = 5 + 20 * torch.rand((2, sensor.height, sensor.width), generator=torch.Generator().manual_seed(0))
-    images = RangeImage.masked(range_m, range_m < 22, sensor)
+    images = two_images(generator.sensor)
     objective = generator.transformer_objective().train()
     loss = objective(Example(images), torch.Generator().manual_seed(5))["loss"].detach()
     grid = generator.get_tokenizer().encode(images).tokens
