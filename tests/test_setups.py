@@ -45,7 +45,6 @@ def look(*parts, columns=SENSOR.width, **setup):
         ({"reflectance_scale": 0.0}, "got reflectance_scale=0"),
         ({"reflectance_power": 9.0}, "got reflectance_power=9"),
         ({"weak_dimming": 1.5}, "got weak_dimming=1.5"),
-        ({"reading_frequency": (1.0, 0.0)}, "got reading_frequency="),
         ({"fades_to_m": -1.0}, "got fades_to_m=-1"),
         ({"fades_from_m": 60.0, "fades_to_m": 20.0}, "got fades_from_m=60, fades_to_m=20; wanted a range that is farther"),
     ],
@@ -165,16 +164,6 @@ def test_contrast_and_fading_of_readings():
     for range_m, share in ((10, 1), (20, 1), (30, 0.75), (50, 0.25), (70, 0)):
         read = read_as(scattered, strong, range_m, fades_from_m=20.0, fades_to_m=60.0)
         assert read == pytest.approx(scattered * share, abs=0.006)
-
-
-def test_readings_are_as_frequent_as_the_set_up_says():
-    even = np.linspace(0, 0.0999, 100_000)
-    frequency = (1.0, 0.5, 2.0, 0.5, 1.0)
-    read = read_as(even, 9.0, reading_frequency=frequency, reflectance_scale=0.999)  # 255ths: five in a step
-    counts = np.histogram(read, np.array([0, 2, 4, 6, 8, 10]) / 100 + 1e-4)[0]
-    assert counts / counts.sum() == pytest.approx(np.array(frequency) / 5, abs=0.05)
-    assert (np.diff(read) >= 0).all()
-    assert read_as([0.5], 9.0, reading_frequency=frequency) == pytest.approx(0.5)
 
 
 def test_far_roads_of_a_pandar64_read_as_near_ones():

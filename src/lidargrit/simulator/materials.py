@@ -9,8 +9,6 @@ class Material:
 
     Args:
         diffuse: factor on the triangle's albedo, the share scattered evenly; clear coats and panes scatter little.
-        contrast: exponent of that albedo before the factor: below 1 for materials that differ less from place to place
-            than the scenes' albedos do, above 1 for those that differ more.
         gloss: strength of the mirror-like lobe, seen only close to normal incidence.
         lobe_power: exponent of the cosine of incidence in that lobe; the higher, the narrower.
         retroreflection: strength of the lobe that goes straight back whatever the incidence (foils, number plates).
@@ -20,7 +18,6 @@ class Material:
 
     name: str
     diffuse: float = 1.0
-    contrast: float = 1.0
     gloss: float = 0.0
     lobe_power: float = 1.0
     retroreflection: float = 0.0
@@ -36,13 +33,12 @@ ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOT
 # diffuse and passes of glass, foil. With them come the albedos that the scenes sample, so a diffuse may be above 1.
 # Plaster and brick were then made brighter by .15, until the reflectance of all scans together was as near as before:
 # in labelled scans walls read brighter than roads (.42 and .25).
-# Contrasts, and with them the same materials' diffuse, are set by hand: ground reads .22 to .31 in nearly all scans of
-# KITTI, half of what the albedos of streets spread; cars read 0 or .2 to .4, so bright paint scatters as plaster does.
+# Diffuse of paint is set by hand: cars read 0 or .2 to .4, so bright paint scatters as plaster does.
 # Mottle is set so that readings of one class spread as in labelled scans.
 # The other numbers are set by eye: bodies of cars fade out in rows, their windows are dark.
 MATERIALS: tuple[Material, ...] = (
-    Material("asphalt", diffuse=0.69, contrast=0.5),
-    Material("concrete", diffuse=0.63, contrast=0.5, mottle=0.06),
+    Material("asphalt", diffuse=1.66),
+    Material("concrete", diffuse=1.09, mottle=0.06),
     Material("plaster", diffuse=0.82, mottle=0.1),
     Material("brick", diffuse=1.17, mottle=0.12),
     Material("metal", gloss=0.966, lobe_power=30.0),
@@ -50,11 +46,11 @@ MATERIALS: tuple[Material, ...] = (
     # Clear glass would pass 0.9; that of cars and houses is made to keep heat out, which begins at this wavelength.
     Material("glass", diffuse=0.0093, gloss=0.00258, lobe_power=40.0, passes=0.2),
     Material("foil", retroreflection=32.4),
-    Material("leaves", diffuse=0.83, mottle=0.16),
+    Material("leaves", diffuse=0.9, mottle=0.16),
     Material("bark", mottle=0.4),
     Material("cloth"),
     Material("skin"),
     Material("rubber"),
-    Material("grass", diffuse=0.56, contrast=0.5, mottle=0.12),
+    Material("grass", diffuse=0.899, mottle=0.12),
     Material("water", gloss=0.02, lobe_power=200.0, passes=0.95),
 )

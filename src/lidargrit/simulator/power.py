@@ -12,7 +12,6 @@ from lidargrit.simulator.materials import ASPHALT, CONCRETE, GLASS, MATERIALS, M
 from lidargrit.simulator.mesh import Finish
 
 _PATCH_AT_LEAST_DEG = 0.01  # finer than any sensor's columns; every patch of a ring takes memory
-_READING_STEP = 0.02  # of the frequencies of readings
 _INCIDENCE_AT_LEAST = 0.05  # cosine: beyond 87 degrees a beam's footprint ends with the surface
 
 
@@ -61,7 +60,7 @@ class RaydropModel:
     object_spread: float = 0.522
     pulse_spread: float = 0.424
     edge_share: float = 0.05
-    dim_level: float = 2.4
+    dim_level: float = 2.6
     dim_share: float = 0.175
     bright_level: float = 3.4
     reflectance_spread: float = 0.08
@@ -110,13 +109,10 @@ class Surfaces:
         albedo = np.append(finish.albedo, np.float32(0))
         material = np.append(finish.material, np.uint8(len(model.materials)))
         nothing = Material("nothing")
-        diffuse, contrast, gloss, lobe_power, retro, passes, mottle = (
+        diffuse, gloss, lobe_power, retro, passes, mottle = (
             np.array([getattr(m, name) for m in (*model.materials, nothing)], np.float32)
-            for name in ("diffuse", "contrast", "gloss", "lobe_power", "retroreflection", "passes", "mottle")
+            for name in ("diffuse", "gloss", "lobe_power", "retroreflection", "passes", "mottle")
         )
-        for index in np.flatnonzero(contrast != 1):
-            of = material == index
-            albedo[of] **= contrast[index]
         albedo *= diffuse[material]
         gloss, retro = gloss * np.float32(model.gloss), retro * np.float32(model.retroreflection)
         if wet:
@@ -295,18 +291,8 @@ def reflectance(
     if setup.weak_dimming < 1:
         dimmed = 1 - np.float32(setup.weak_dimming) * (1 - dimmed)
     full *= dimmed
-    if setup.reading_frequency:
-        full = _as_read(full, setup.reading_frequency)
     if setup.fades_to_m:
         faded = (np.float32(setup.fades_to_m) - range_m) * np.float32(1 / (setup.fades_to_m - setup.fades_from_m))
         full *= np.clip(faded, 0, 1)
     most, steps = (0.99, 100) if setup.reflectance_scale >= 1 else (1.0, 255)
     return np.round(np.clip(full, 0, most) * np.float32(steps)) * np.float32(1 / steps)
-
-
-def _as_read(reflectance: Float32[np.ndarray, "*shape"], frequency: tuple[float, ...]) -> Float32[np.ndarray, "*shape"]:
-    """Move readings towards those that a sensor prefers; the last of the steps, and what is above them, stays."""
-    step_ends = _READING_STEP * np.arange(len(frequency) + 1)
-    reached = np.cumsum((0.0, *frequency))
-    read = np.interp(reflectance, reached * (step_ends[-1] / reached[-1]), step_ends)
-    return np.where(reflectance < step_ends[-1], read, reflectance).astype(np.float32)

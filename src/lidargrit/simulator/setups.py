@@ -34,8 +34,6 @@ _READING = (
     0.95, 0.95, 0.95, 0.85, 0.75, 0.95, 1.15, 1.1, 0.9, 0.95, 0.75, 1.0, 1.0, 1.0, 1.0, 0.9,
     0.85, 1.05, 1.15, 0.7, 0.95, 0.85, 0.85, 0.95, 1.0, 1.15, 0.85, 0.85, 0.85, 1.05, 1.2, 1.1,
 )
-# In all drives, whatever the laser, near ground seldom reads .06, .12 or .22, and often .04, .1 or .18.
-_READING_FREQUENCY = (1.0, 0.9, 2.2, 0.45, 0.8, 1.05, 0.35, 0.6, 1.9, 1.7, 0.75, 0.5, 0.75, 0.95, 1.15, 0.95)
 # fmt: on
 _KITTI = SensorSetup(
     # Measured along the rows of odometry 00 and of the raw drive 9005 (scans.surface_patches): .7 cm near, 1.4 at 23 m.
@@ -46,7 +44,6 @@ _KITTI = SensorSetup(
     farthest_m=80.0,  # of the files, not of the sensor, which sees to 120 m
     divergence_mrad=2.0,  # data sheet of the HDL-64E S2
     pulse_length_m=0.75,  # pulses of 5 ns, by the same data sheet, so c t / 2
-    reading_frequency=_READING_FREQUENCY,
     fades_from_m=18.0,  # walls and leaves of four sets of KITTI's scans read alike to there, half as bright at 40 m
     fades_to_m=60.0,  # four in five returns beyond read 0
     split_exponent=6.0,  # so that as many depth jumps have a drop

@@ -12,7 +12,6 @@ from lidargrit.core.typed_values import Bounds, Share
 _OffsetM = Annotated[float, Bounds(-0.5, 0.5)]
 _LogGain = Annotated[float, Bounds(-5, 5)]
 _Factor = Annotated[float, Bounds(0.1, 10)]
-_Frequency = Annotated[float, Bounds(above=0, most=10)]
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,6 @@ class SensorSetup(Settings):
         reflectance_power: exponent of all reflectances before that factor: 1 for the units of the materials, in which
             KITTI's HDL-64E reads; above 1 for makers whose scale has more contrast.
         weak_dimming: share by which weak echoes read too dark: 1 as those of an HDL-64E, which fall to 0; 0 for none.
-        reading_frequency: frequency of each reading, in steps of .02 from 0, relative to one that reads evenly;
-            none for such a sensor. Some electronics prefer some numbers.
         fades_from_m: range from which reflectances read too dark, growing evenly until they read 0 at ``fades_to_m``.
         fades_to_m: range from which all reflectances read 0; 0 for sensors whose readings do not fade.
         height_m: height above the road, in metres.
@@ -63,7 +60,6 @@ class SensorSetup(Settings):
     reflectance_scale: Annotated[float, Bounds(0.01, 10)] = 1.0
     reflectance_power: Annotated[float, Bounds(0.5, 4)] = 1.0
     weak_dimming: Share = 1.0
-    reading_frequency: Annotated[tuple[_Frequency, ...], Bounds(0, 50)] = ()
     fades_from_m: Annotated[float, Bounds(0, 1000)] = 0.0
     fades_to_m: Annotated[float, Bounds(0, 1000)] = 0.0
     height_m: Annotated[float, Bounds(0.1, 10)] = 1.73

@@ -192,8 +192,8 @@ def make_vehicles(
     """Sample vehicles of given kinds: a shape, a colour and an instance each."""
     count = len(kinds)
     shapes = tuple(vehicle_shape(int(k), int(v)) for k, v in zip(kinds, rng.integers(0, VARIANTS, count), strict=True))
-    dark = rng.random(count) < 0.5
-    paint = np.where(dark, np.exp(rng.uniform(np.log(0.002), np.log(0.05), count)), rng.uniform(0.05, 0.4, count))
+    dark = rng.random(count) < 0.7
+    paint = np.where(dark, np.exp(rng.uniform(np.log(0.0006), np.log(0.015), count)), rng.uniform(0.08, 0.34, count))
     paint = np.where(kinds >= PANEL_VAN, np.maximum(paint, rng.uniform(0.02, 0.4, count)), paint)
     albedo = np.empty((count, len(_MATERIALS)), np.float32)
     albedo[:, _PAINT], albedo[:, _GLASS], albedo[:, _RUBBER], albedo[:, _PLATE] = paint, 0.02, 0.03, 0.5
