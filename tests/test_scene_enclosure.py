@@ -5,6 +5,7 @@ import pytest
 
 from lidargrit.scans import classes
 from lidargrit.simulator.mesh import Mesh
+from lidargrit.simulator.scene.clutter import clutter
 from lidargrit.simulator.scene.greenery import greenery
 from lidargrit.simulator.scene.layout import driving, parked
 from lidargrit.simulator.scene.plan_sampling import sample_street_plan
@@ -176,3 +177,23 @@ def test_cars_fill_the_lanes_of_wide_roads_and_the_squares_before_houses():
         court = (cars.v_m > plan.edge_m[1] + plan.pavement_m[1] + 0.5) & (cars.v_m < plan.front(1) - 1.5) & cars.across
         full += court.sum() > 4
     assert full > 0.6 * len(squares)
+
+
+def test_what_fills_pavements_is_clear_of_roads_and_ends_with_them():
+    rows = 0
+    for plan, rng in plans("city"):
+        batch = clutter(rng, plan)
+        place = batch.placements
+        u, side = place.u_m, (place.v_m > 0).astype(int)
+        kerb = np.array(plan.edge_m)[side]
+        front = np.array([-plan.front(-1), plan.front(1)])[side]
+        assert (np.abs(place.v_m) > kerb).all()
+        assert (np.abs(place.v_m) < np.maximum(front, kerb + np.array(plan.pavement_m)[side])).all()
+        assert (plan.in_side_street(u, place.v_m) < 0).all()
+        assert plan.goes_on(u).all()
+        lengths = [np.ptp(shape.triangles_m[..., 0]) for shape in batch.shapes]
+        rows += sum(length > 3.5 for length in lengths)  # pieces of hoardings, scaffolds and railings, or long beds
+    assert rows > len(SEEDS)
+    counts = {theme: np.mean([len(clutter(rng, plan).placements) for plan, rng in plans(theme)])
+              for theme in ("city", "suburb", "country")}  # fmt: skip
+    assert counts["country"] == 0 < 4 * counts["suburb"] < counts["city"], counts

@@ -172,7 +172,7 @@ def owners(counts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
     return np.repeat(np.arange(len(counts)), counts)
 
 
-def rows_of(*columns: float | Num[np.ndarray, " n"]) -> Float64[np.ndarray, "n c"]:
+def rows_of(*columns: int | float | Num[np.ndarray, " n"]) -> Float64[np.ndarray, "n c"]:
     """Return columns, or numbers for whole columns, side by side."""
     rows = np.empty((next(len(c) for c in columns if isinstance(c, np.ndarray)), len(columns)))
     for at, column in enumerate(columns):
