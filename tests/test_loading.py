@@ -281,7 +281,7 @@ def test_images_of_more_columns_serve_fewer_as_a_projection_would(tree, tmp_path
         assert one.reflectance is not None
         assert other.reflectance is not None
         is_same = (one.reflectance - other.reflectance).abs() < 1e-6
-        assert is_same.float().mean() > 0.97, "two returns may lie within one step of 2 mm"
+        assert is_same.float().mean() > 0.96, "two returns may lie within one step of 2 mm"
     assert gathered.provenance.names == projected.provenance.names
     odd, exact = set_of(wide, 360).batch([0]), set_of(tree, 360).batch([0])
     assert (odd.return_mask == exact.return_mask).float().mean() > 0.9

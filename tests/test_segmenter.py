@@ -1,6 +1,7 @@
 """The segmenter: it learns and resumes, labels every point, and its labels are scored and coloured."""
 
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -24,7 +25,13 @@ from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import simulate
-from lidargrit.systems.segmenter.system import Segmenter, SegmenterConfig, SegmenterNetworkConfig, SegmenterObjective
+from lidargrit.systems.segmenter.system import (
+    Segmenter,
+    SegmenterConfig,
+    SegmenterNetworkConfig,
+    SegmenterObjective,
+    bends_across_columns,
+)
 from tiny_runs import learn, the_one_line
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
@@ -127,6 +134,22 @@ def test_images_of_more_columns_are_labelled_column_by_column(run):
         some = [each[..., first::4] for each in (images.range_m, images.return_mask, images.reflectance)]
         alone = segmenter.segment(RangeImage(some[0], some[1], SENSOR, {"reflectance": some[2]}))
         assert torch.equal(label[..., first::4], alone.label)
+
+
+def test_bends_are_those_of_a_loop_and_nearly_none_on_a_wall():
+    range_m = torch.from_numpy(np.random.default_rng(0).uniform(2, 60, (2, 4, 16)).astype(np.float32))
+    range_m[:, 1, ::3] = 0
+    found = bends_across_columns(range_m)
+    for image, row, column in np.ndindex(2, 4, 16):
+        left, own, right = (float(range_m[image, row, (column + step) % 16]) for step in (-1, 0, 1))
+        bend = own * (1 / left + 1 / right) / 2 - 1 if left and own and right else 0.0
+        wanted = math.copysign(math.log1p(abs(bend) / 0.005) / 3, bend)
+        assert float(found[image, row, column]) == pytest.approx(wanted, abs=1e-4)
+    turn = torch.linspace(-1, 1, 201)  # a wall 10 m ahead, in columns of half a degree
+    wall = (10 / turn.cos()).expand(1, 1, -1)
+    assert bends_across_columns(wall)[..., 1:-1].abs().max() < 0.01
+    rough = wall + 0.3 * torch.randn(wall.shape, generator=torch.Generator().manual_seed(0))
+    assert bends_across_columns(rough)[..., 1:-1].abs().median() > 0.3
 
 
 def test_every_point_has_the_label_of_the_nearest_return_along_its_ray():

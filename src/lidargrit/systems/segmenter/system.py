@@ -27,6 +27,7 @@ from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
 _NUM_MAPS = 4
 _HEIGHT_M = 3.0  # the scale of heights: what stands on the ground is about so high
 _HEIGHTS_AT_MOST = 4.0  # times that
+_BEND, _BEND_STEPS = 0.005, 3.0  # a small bend relative to inverse range; scale of the logarithm of bends
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,8 @@ class SegmenterNetworkConfig(Settings):
         attention_layers: layers of attention between all pixels at an eighth, among the residual blocks.
         heads: attention heads of each layer.
         reflectance: whether the network sees the reflectance of returns, where scans have it.
+        bends: whether it sees how inverse range bends from each return's neighbour on the left to that on the right:
+            not at all on a plane at whatever range, so that leaves do not look like walls.
     """
 
     widths: tuple[Count, Count, Count] = (32, 64, 96)
@@ -46,6 +49,7 @@ class SegmenterNetworkConfig(Settings):
     attention_layers: NotNegative = 1
     heads: Count = 4
     reflectance: bool = True
+    bends: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -68,7 +72,7 @@ class SegmenterNetwork(nn.Module):
         self.register_buffer("elevation_rad", sensor.elevation_rad.double().mean(1).float(), persistent=False)
         sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
         parts = {"reflectance": Part(2, 0)} if config.reflectance else {}
-        self.unet = SmallUnet(sizes, _NUM_MAPS, NUM_CLASSES, parts)
+        self.unet = SmallUnet(sizes, _NUM_MAPS + config.bends, NUM_CLASSES, parts)
 
     elevation_rad: Tensor
 
@@ -93,13 +97,29 @@ class SegmenterNetwork(nn.Module):
         label = labels_of(self(images.range_m, images.reflectance).argmax(1) + 1)
         return torch.where(images.return_mask, label, 0)
 
-    def _maps(self, range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B 4 H W"]:
-        """Return maps of returns, their ranges and heights, and the elevations of the rays."""
+    def _maps(self, range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B C H W"]:
+        """Return maps of returns, their ranges and heights, the elevations of the rays, and bends if wanted."""
         returned = range_m > 0
         elevation = self.elevation_rad[:, None].expand_as(range_m)
         height = (range_m * elevation.sin() / _HEIGHT_M).clamp(-_HEIGHTS_AT_MOST, _HEIGHTS_AT_MOST)
         near = torch.where(returned, range_m.log1p() - TYPICAL_LOG_RANGE, 0.0)
-        return torch.stack((returned.to(range_m.dtype), near, height, 5 * elevation), 1)
+        maps = [returned.to(range_m.dtype), near, height, 5 * elevation]
+        if self.config.bends:
+            maps.append(bends_across_columns(range_m))
+        return torch.stack(maps, 1)
+
+
+def bends_across_columns(range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
+    """Return how inverse range bends at each return, relative to itself and in logarithmic steps of both signs.
+
+    On a plane the inverse range is a cosine of the azimuth, so it hardly bends at all. The last column is beside the
+    first one; a return without both neighbours has 0.
+    """
+    inverse = torch.where(range_m > 0, 1 / range_m, 0.0)
+    left, right = inverse.roll(1, 2), inverse.roll(-1, 2)
+    bend = torch.where((left > 0) & (right > 0), range_m * (left + right) / 2 - 1, 0.0)
+    bend = torch.where(range_m > 0, bend, 0.0)
+    return bend.sign() * (bend.abs() / _BEND).log1p() / _BEND_STEPS
 
 
 _SETTING = "model.segmenter.reflectance"
