@@ -46,7 +46,7 @@ def look(*parts, columns=SENSOR.width, **setup):
         ({"reflectance_power": 9.0}, "got reflectance_power=9"),
         ({"weak_dimming": 1.5}, "got weak_dimming=1.5"),
         ({"fades_to_m": -1.0}, "got fades_to_m=-1"),
-        ({"fades_from_m": 60.0, "fades_to_m": 20.0}, "got fades_from_m=60, fades_to_m=20; wanted a range that is farther"),
+        ({"fades_from_m": 60.0, "fades_to_m": 20.0}, "got fades_from_m=60, fades_to_m=20; wanted a range"),
     ],
 )
 def test_numbers_out_of_bounds_are_refused(change, message):
