@@ -33,7 +33,8 @@ ASPHALT, CONCRETE, PLASTER, BRICK, METAL, PAINT, GLASS, FOIL, LEAVES, BARK, CLOT
 # diffuse and passes of glass, foil. With them come the albedos that the scenes sample, so a diffuse may be above 1.
 # Plaster and brick were then made brighter by .15, until the reflectance of all scans together was as near as before:
 # in labelled scans walls read brighter than roads (.42 and .25).
-# Diffuse of paint is set by hand: cars read 0 or .2 to .4, so bright paint scatters as plaster does.
+# Diffuse of paint and leaves is then set by hand: cars read 0 or .2 to .4, so bright paint scatters as plaster does;
+# leaves read a little too bright with KITTI's sensor and too dark with PandaSet's.
 # Mottle is set so that readings of one class spread as in labelled scans.
 # The other numbers are set by eye: bodies of cars fade out in rows, their windows are dark.
 MATERIALS: tuple[Material, ...] = (
