@@ -117,8 +117,8 @@ def bends_across_columns(range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B H 
     """
     inverse = torch.where(range_m > 0, 1 / range_m, 0.0)
     left, right = inverse.roll(1, 2), inverse.roll(-1, 2)
-    bend = torch.where((left > 0) & (right > 0), range_m * (left + right) / 2 - 1, 0.0)
-    bend = torch.where(range_m > 0, bend, 0.0)
+    known = (inverse > 0) & (left > 0) & (right > 0)
+    bend = torch.where(known, range_m * (left + right) / 2 - 1, 0.0)
     return bend.sign() * (bend.abs() / _BEND).log1p() / _BEND_STEPS
 
 
