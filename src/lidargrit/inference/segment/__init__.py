@@ -4,16 +4,21 @@ import math
 from operator import itemgetter
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import locate
+from lidargrit.generation.batches import one_by_one
 from lidargrit.generation.generator import load
+from lidargrit.generation.semantic_classes import NUM_CLASSES
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.segmenter.system import Segmenter
+from lidargrit.systems.segmenter.system import Segmenter, with_likeliest
 
 _SAME_ROW_RAD = math.radians(0.01)
+_SAME_SURFACE_M, _SAME_SURFACE_PER_RANGE = 0.2, 0.02  # returns of a surface differ in range by at most this
 
 
 def open_segmenter(word: str, device: str = "") -> Segmenter:
@@ -43,19 +48,43 @@ def can_label(own: SensorModel, sensor: SensorModel) -> bool:
 def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
     """Return images with labels, in the computer's memory.
 
-    Of n times the segmenter's columns every n-th make an image that it knows: n such images are labelled one by one.
-    A segmenter does not see at which azimuth a column lies, so it does not matter at which the first one does.
+    Of n times the segmenter's columns every n-th make an image that it knows: n such images are labelled one by one,
+    every second one as its mirror image. A segmenter does not see at which azimuth a column lies, so it does not
+    matter at which the first one does. Then all n vote on each return (:func:`mean_over_columns`).
 
     Args:
         segmenter: segmenter of a run.
         images: batch of range images (B, H, W) for which :func:`can_label` holds.
     """
-    steps = images.sensor.width // segmenter.sensor.width
-    label = torch.zeros(images.range_m.shape, dtype=torch.int64)
+    return RangeImage.cat([_label_image(segmenter, image) for image in one_by_one(images)])
+
+
+def _label_image(segmenter: Segmenter, image: RangeImage) -> RangeImage:
+    steps = image.sensor.width // segmenter.sensor.width
+    of_class = torch.zeros(1, NUM_CLASSES, image.sensor.height, image.sensor.width)
     for first in range(steps):
         part = (..., slice(first, None, steps))
-        some = images.mapped(itemgetter(part), segmenter.sensor)
-        found = segmenter.segment(some).label
-        assert found is not None
-        label[part] = found.cpu()
-    return images.to("cpu").with_planes(label=label)
+        some = image.mapped(itemgetter(part), segmenter.sensor)
+        of_class[part] = segmenter.probabilities(some, mirrored=first % 2 == 1).cpu()
+    image = image.to("cpu")
+    return with_likeliest(image, mean_over_columns(of_class, image.range_m, steps // 2))
+
+
+def mean_over_columns(
+    of_class: Float[Tensor, "B C H W"], range_m: Float[Tensor, "B H W"], columns: int
+) -> Float[Tensor, "B C H W"]:
+    """Return the mean of values over the returns of a row that lie about as far away, for each return.
+
+    Args:
+        of_class: values of every pixel.
+        range_m: range of the returns, 0 where nothing returned.
+        columns: number of columns to either side that count; the last column is beside the first.
+    """
+    total, count = torch.zeros_like(of_class), torch.zeros_like(range_m)
+    within_m = _SAME_SURFACE_M + _SAME_SURFACE_PER_RANGE * range_m
+    for step in range(-columns, columns + 1):
+        other_m = range_m.roll(step, -1)
+        same = ((other_m > 0) & ((other_m - range_m).abs() < within_m)).to(of_class.dtype)
+        total += of_class.roll(step, -1) * same[:, None]
+        count += same
+    return total / count.clamp(min=1)[:, None]

@@ -92,11 +92,6 @@ class SegmenterNetwork(nn.Module):
         logits, _ = self.unet(self._maps(range_m), more)
         return logits.float()
 
-    def classes(self, images: RangeImage) -> Int[Tensor, "B H W"]:
-        """Return the likeliest class of each return, by SemanticKITTI's numbers; 0 where nothing returned."""
-        label = labels_of(self(images.range_m, images.reflectance).argmax(1) + 1)
-        return torch.where(images.return_mask, label, 0)
-
     def _maps(self, range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B C H W"]:
         """Return maps of returns, their ranges and heights, the elevations of the rays, and bends if wanted."""
         returned = range_m > 0
@@ -179,6 +174,11 @@ def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"])
     return counts.view(NUM_CLASSES, NUM_CLASSES + 1)[:, 1:]
 
 
+def with_likeliest(images: RangeImage, of_class: Float[Tensor, "B 19 H W"]) -> RangeImage:
+    """Return images whose label is the likeliest class of each return, by SemanticKITTI's numbers."""
+    return images.with_planes(label=torch.where(images.return_mask, labels_of(of_class.argmax(1) + 1), 0))
+
+
 @dataclass(frozen=True)
 class SegmenterConfig(Settings):
     """The network, which is the whole system."""
@@ -222,10 +222,26 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
         Args:
             images: batch of range images (B, H, W); labels that they have are not read.
         """
+        return RangeImage.cat([with_likeliest(image, self.probabilities(image)) for image in one_by_one(images)])
+
+    @inference()
+    def probabilities(self, images: RangeImage, mirrored: bool = False) -> Float[Tensor, "B 19 H W"]:
+        """Return the probability of each of the benchmark's classes at every pixel, on the images' device.
+
+        Args:
+            images: batch of range images (B, H, W), each computed by itself.
+            mirrored: whether the network sees their mirror images, left and right exchanged.
+        """
         check_images(images, self.sensor)
         self.eval()
-        found = [self.segmenter.classes(image) for image in one_by_one(images.to(self.device))]
-        return images.with_planes(label=torch.cat(found).to(images.range_m.device))
+        found = list[Tensor]()
+        for image in one_by_one(images.to(self.device)):
+            seen = [image.range_m, image.reflectance]
+            if mirrored:
+                seen = [None if each is None else each.flip(-1) for each in seen]
+            of_class = self.segmenter(*seen).softmax(1)
+            found.append(of_class.flip(-1) if mirrored else of_class)
+        return torch.cat(found).to(images.range_m.device)
 
     def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of labelling one scan, counted while it is computed."""
