@@ -18,6 +18,7 @@ from lidargrit.evaluation.realism import CURVES, SimulatedScans, compare, drop_i
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargrit.system import LidarGrit
+from lidargrit.systems.raydrop.system import Raydrop
 from lidargrit.viewer.curves import plot_curves
 
 SENSOR = load_sensor("hdl64e_kitti_odometry")
@@ -174,6 +175,10 @@ def test_the_verb(tmp_path, capsys, monkeypatch):
     kinds = ["simulated"] * 5 + ["real"] * 5 + ["real_triangulated"] * 5
     assert [score["scans"] for score in found["raydrop"]] == kinds
     assert picture.read_bytes().startswith(b"\x89PNG")
+    Raydrop(Raydrop.smallest_config(SENSOR), SENSOR).save(tmp_path / "drops")
+    file.unlink()
+    assert main([*few, "--model", str(tmp_path / "drops"), "--json", str(file)]) == 0  # a network without a tokenizer
+    assert [score["scans"] for score in json.loads(file.read_text())["raydrop"]] == kinds[:5] + kinds[10:]
     assert main(words) == 2  # it is there already
     assert "add --overwrite" in capsys.readouterr().err
     assert main([*words, "--overwrite", "--device", "cuda:99"]) == 2

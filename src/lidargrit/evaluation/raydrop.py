@@ -86,25 +86,30 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
 
 
 def raydrop_model(word: str, device: str = "") -> Generator:
-    """Load a run that drops returns of clean scans, and has a tokenizer to estimate those of real scans.
+    """Load a run that drops returns of clean scans.
 
     Args:
         word: folder of a finished run, or ``pretrained``.
     """
     generator = load(word).to(usable_device(device))
     _check(generator)
-    _check_tokenizer(generator)
     return generator
 
 
 def scores_of_model(generator: Generator, simulated: SimulatedScans, real: RangeImages) -> list[CurveScore]:
-    """Score a model's drops: on simulated scans, whose clean ranges are known, and on real ones, estimated twice."""
-    decoded, true = decoded_surfaces(generator, real)
-    pairs = {
-        "simulated": (simulated.clean, simulated.measured),
-        "real": (decoded, true),
-        "real_triangulated": (triangulated_surfaces(true), true),
-    }
+    """Score a model's drops: on simulated scans, whose clean ranges are known, and on real ones.
+
+    The clean ranges of real scans are interpolated, and decoded if the model has a tokenizer.
+    """
+    if not generator.sensor.same_rays(real.sensor):
+        raise ConfigError(
+            f"a model of {generator.sensor.name!r}", f"one of {real.sensor.name!r}", "name a model of the scans' sensor"
+        )
+    true = real.batch(range(len(real)))
+    pairs = {"simulated": (simulated.clean, simulated.measured)}
+    if "encode" in generator.capabilities:
+        pairs["real"] = decoded_surfaces(generator, real)
+    pairs["real_triangulated"] = triangulated_surfaces(true), true
     return [score for scans, (clean, of) in pairs.items() for score in score_raydrop(generator, scans, clean, of)]
 
 
@@ -114,11 +119,6 @@ def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImag
 
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
     """
-    _check_tokenizer(generator)
-    if not generator.sensor.same_rays(real.sensor):
-        raise ConfigError(
-            f"a model of {generator.sensor.name!r}", f"one of {real.sensor.name!r}", "name a model of the scans' sensor"
-        )
     tokenizer, sensor = generator.get_tokenizer(), generator.sensor
     true = real.batch(range(len(real)))
     ranges = [
@@ -146,9 +146,3 @@ def _check(generator: Generator) -> None:
     if "surfaces" not in generator.conditions:
         got = f"{generator.public_name()!r}, which drops no returns of clean scans"
         raise ConfigError(got, "a model that does, such as pretrained", "name another model")
-
-
-def _check_tokenizer(generator: Generator) -> None:
-    if "encode" not in generator.capabilities:
-        got = f"{generator.public_name()!r}, which has no tokenizer to decode clean ranges by"
-        raise ConfigError(got, "a model with one, such as pretrained", "name another model")
