@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from lidargrit.core.errors import ConfigError
 from lidargrit.scans.augmentation import augment
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
@@ -42,6 +43,41 @@ def test_roll_turns_each_image_by_whole_columns():
     rolled = augment(Example(images), ("roll",), torch.Generator().manual_seed(0)).images.range_m
     for before, after in zip(images.range_m, rolled, strict=True):
         assert any(torch.equal(before.roll(-shift, -1), after) for shift in range(SENSOR.width))
+
+
+def labelled(seed, columns=16):
+    """Return eight images with labels of roads, buildings, cars (with instances), riders and people."""
+    rng, sensor = torch.Generator().manual_seed(seed), SENSOR.with_columns(columns)
+    size = (8, sensor.height, columns)
+    images = RangeImage.masked(torch.rand(size, generator=rng) * 50 + 1, torch.rand(size, generator=rng) < 0.7, sensor)
+    label = torch.tensor([40, 50, 10 + (3 << 16), 253, 30])[torch.randint(5, size, generator=rng)]
+    return images.with_planes(label=torch.where(images.return_mask, label, 0))
+
+
+def test_paste_shows_nearer_vehicles_and_people_of_another_scan():
+    images, others = labelled(0), labelled(1)
+    pasted = augment(Example(images), ("paste",), torch.Generator().manual_seed(0), lambda: others).images
+    unchanged = 0
+    for one, before, other in zip(pasted, images, others, strict=True):
+        if torch.equal(one.range_m, before.range_m):
+            unchanged += 1
+            continue
+        fitting = 0
+        for shift in range(16):
+            wanted_m, wanted = before.range_m.clone(), before.label.clone()
+            for row in range(64):
+                for column in range(16):
+                    range_m, label = (float(other.range_m[row, column - shift]), int(other.label[row, column - shift]))
+                    own_m = float(before.range_m[row, column])
+                    if label & 0xFFFF in (10, 253, 30) and range_m > 0 and (own_m == 0 or range_m < own_m):
+                        wanted_m[row, column], wanted[row, column] = range_m, label
+            fitting += torch.equal(one.range_m, wanted_m) and torch.equal(one.label, wanted)
+        assert fitting == 1
+        assert torch.equal(one.return_mask, one.range_m > 0)
+    assert 1 <= unchanged <= 7
+    bare = Example(images_of(1))
+    with pytest.raises(ConfigError, match=r"^got the augmentation paste of scans without labels; wanted scans with"):
+        augment(bare, ("paste",), torch.Generator(), lambda: bare.images)
 
 
 def test_geometric_fills_with_no_return_and_the_programs_with_a_far_wall():

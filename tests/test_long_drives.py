@@ -17,7 +17,7 @@ from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M
 from lidargrit.simulator.tracing import Tracer, objects_in_reach
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(256)
-# Points, mean range and reflectance, mean class of frames of drives of 100 m or less, in streets of version 3.
+# Points, mean range and reflectance, mean class of frames of drives of 100 m or less, in streets of version 3 and 4.
 BEFORE = {
     (0, "mixed", 0, False): (14221, 18.6177, 0.23359, 64.607),
     (0, "mixed", 5, True): (14198, 18.3457, 0.23763, 64.465),

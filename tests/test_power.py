@@ -167,6 +167,9 @@ def test_glass_shows_what_is_behind_it_sometimes(seen):
     came_back = range_m > 0
     assert 0.2 < came_back.mean() <= 1
     assert (range_m[came_back] > 12.5).mean() > 0.2
+    dusty = look(street(), setup=replace(GAPS, glass_scatters=400.0)).range_m[behind_window]
+    assert (dusty > 0).mean() > 0.9
+    assert dusty.max() < 7  # the pane itself
 
 
 def test_drops_stand_in_patches(seen):

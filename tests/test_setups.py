@@ -205,7 +205,7 @@ def test_patches_of_nothing_tell_nothing():
 
 def test_provenance_tells_the_version_of_the_streets():
     streets = open_dataset("simulated:2")
-    assert Provenance(recordings=(streets.recording(0),)).streets == ("streets 3",)
+    assert Provenance(recordings=(streets.recording(0),)).streets == ("streets 4",)
     assert Provenance(recordings=("simulated/seed_0000000", "a/b")).streets == ("streets 1",)
     assert Provenance(recordings=("kitti/00",)).streets == ()
 

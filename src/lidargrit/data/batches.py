@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Int64
@@ -110,11 +111,18 @@ class Batches:
             gaps = [self._pasts.random_gap(index, rng) for index, rng in zip(indices, rngs, strict=True)]
             example = replace(example, condition=self._pasts.of(indices, first_columns, gaps))
         if self.augmentations:
-            each = [augment(example[i : i + 1], self.augmentations, rng) for i, rng in enumerate(rngs)]
+            another = [partial(self._another, index, rng) for index, rng in zip(indices, rngs, strict=True)]
+            each = [augment(example[i : i + 1], self.augmentations, rngs[i], another[i]) for i in range(len(rngs))]
             example = Example.cat(each)
         if self._condition_of is not None and self._pasts is None:
             example = replace(example, condition=self._condition_of(example.images))
         return example.with_keys() if self._with_keys else example
+
+    def _another(self, index: int, rng: torch.Generator) -> RangeImage:
+        """Read any image of the sensor of one of the images, as a batch of one."""
+        alike = next(each for each in self._by_sensor if len(self._by_sensor) == 1 or index in each)
+        chosen = alike[int(torch.randint(len(alike), (1,), generator=rng))]
+        return self.images.batch([chosen])
 
     def _scan_at(self, position: int) -> int:
         epoch, index = divmod(position, self._epoch_length)

@@ -1,7 +1,7 @@
 """Training examples → randomly changed ones: all planes of an image change together, and the past turns with it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -11,11 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.scans.classes import CLASS_BITS, CLASSES
 from lidargrit.scans.example import Example
 from lidargrit.scans.past import Past
 from lidargrit.scans.types import RangeImage
 
-Augmentation = Literal["flip", "roll", "geometric", "geometric_reference"]
+Augmentation = Literal["flip", "roll", "paste", "geometric", "geometric_reference"]
+
+_THINGS = torch.tensor([number for number, each in CLASSES.items() if each.group in ("vehicle", "person, cycle")])
 
 _MAX_ROTATION_RAD = math.radians(30)  # the program: random affine of up to 30 degrees, ...
 _MAX_SHIFT = 0.1  # ... shifts of a tenth of the image, ...
@@ -23,22 +26,32 @@ _MAX_SCALE_CHANGE = 0.1  # ... and scales from 0.9 to 1.1
 _EXTRA_ROTATION_RAD = math.radians(45)  # the program rotates by up to 45 degrees before that
 
 
-def augment(example: Example, kinds: Sequence[Augmentation], rng: torch.Generator) -> Example:
+def augment(
+    example: Example,
+    kinds: Sequence[Augmentation],
+    rng: torch.Generator,
+    another: Callable[[], RangeImage] | None = None,
+) -> Example:
     """Change every example of a batch at random.
 
     Args:
         kinds: kinds of change, made one after the other. ``flip`` mirrors left and right with probability 1/2. ``roll``
-            turns the scan about the vertical axis by a random number of columns. ``geometric`` is the paper's geometric
+            turns the scan about the vertical axis by a random number of columns. ``paste`` shows, with probability 1/2,
+            also the vehicles, people and bicycles of another scan, turned at random, where they are nearer than what
+            the scan itself shows, or where it has no return; both need labels. ``geometric`` is the paper's geometric
             preservation: with probability 1/2, an affine map and flips along both axes; pixels from outside the image
             are *no return*. ``geometric_reference`` is the same with the larger rotation of the authors' program, which
             fills such pixels with returns at the longest range.
+        another: function that reads another batch of as many images of the same sensor, for ``paste``.
 
     Raises:
-        ConfigError: a geometric change of a scan with a past, whose rays would no longer be those of its sensor.
+        ConfigError: a geometric change of a scan with a past, whose rays would no longer be those of its sensor; or
+            ``paste`` of scans without labels.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2.2 (the paper gives no numbers); numbers from the program,
-        hamedhaghighi/LidarGRIT@a3f86e7.
+        hamedhaghighi/LidarGRIT@a3f86e7. ``paste``: Xiao et al., PolarMix, NeurIPS 2022, "instance-level rotate-paste",
+        here once, on range images, and behind what hides it.
     """
     for kind in kinds:
         if kind == "flip":
@@ -47,6 +60,9 @@ def augment(example: Example, kinds: Sequence[Augmentation], rng: torch.Generato
             example = _roll(example, rng)
         elif isinstance(example.condition, Past):
             raise ConfigError(f"the augmentation {kind} of scans with a past", "flip or roll", "leave it out")
+        elif kind == "paste":
+            assert another is not None, "another scan"
+            example = replace(example, images=_paste(example.images, another, rng))
         else:
             change = _geometric if kind == "geometric" else _geometric_reference
             example = replace(example, images=change(example.images, rng))
@@ -73,6 +89,19 @@ def _roll(example: Example, rng: torch.Generator) -> Example:
     if isinstance(condition, Past):
         condition = condition.turned(shift[:, 0, 0] * images.sensor.column_stride)
     return Example(images.mapped(lambda pixels: pixels.gather(-1, column)), condition)
+
+
+def _paste(images: RangeImage, another: Callable[[], RangeImage], rng: torch.Generator) -> RangeImage:
+    if images.label is None:
+        raise ConfigError("the augmentation paste of scans without labels", "scans with labels", "leave it out")
+    chosen = _coin(images, rng)
+    if not chosen.any():
+        return images
+    other = _roll(Example(another()), rng).images
+    assert other.label is not None
+    thing = torch.isin(other.label & CLASS_BITS, _THINGS.to(other.label.device)) & other.return_mask
+    nearer = thing & (~images.return_mask | (other.range_m < images.range_m))
+    return _pick(chosen & nearer, other, images)
 
 
 def _geometric(images: RangeImage, rng: torch.Generator) -> RangeImage:

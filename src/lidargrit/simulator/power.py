@@ -120,6 +120,7 @@ class Surfaces:
             gloss[[ASPHALT, CONCRETE]] = wet * model.wet_gloss
             lobe_power[[ASPHALT, CONCRETE]] = 100  # a film on rough ground: a narrow lobe, a third at 8 degrees
         passes[GLASS] = setup.glass_passes
+        albedo[material == GLASS] *= np.float32(setup.glass_scatters)
         mottle = np.hypot(mottle, np.float32(model.reflectance_spread))
         return cls(albedo, material, gloss, lobe_power, retro, passes, mottle)
 

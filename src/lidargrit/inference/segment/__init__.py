@@ -46,7 +46,18 @@ def can_label(own: SensorModel, sensor: SensorModel) -> bool:
 
 
 def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
-    """Return images with labels, in the computer's memory.
+    """Return images with the likeliest class of each return as its label, in the computer's memory.
+
+    Args:
+        segmenter: segmenter of a run.
+        images: batch of range images (B, H, W) for which :func:`can_label` holds.
+    """
+    labelled = [with_likeliest(image.to("cpu"), class_probabilities(segmenter, image)) for image in one_by_one(images)]
+    return RangeImage.cat(labelled)
+
+
+def class_probabilities(segmenter: Segmenter, image: RangeImage) -> Float[Tensor, "1 19 H W"]:
+    """Return the probability of each of the benchmark's classes at every return, in the computer's memory.
 
     Of n times the segmenter's columns every n-th make an image that it knows: n such images are labelled one by one,
     every second one as its mirror image. A segmenter does not see at which azimuth a column lies, so it does not
@@ -54,20 +65,15 @@ def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
 
     Args:
         segmenter: segmenter of a run.
-        images: batch of range images (B, H, W) for which :func:`can_label` holds.
+        image: batch of one range image for which :func:`can_label` holds.
     """
-    return RangeImage.cat([_label_image(segmenter, image) for image in one_by_one(images)])
-
-
-def _label_image(segmenter: Segmenter, image: RangeImage) -> RangeImage:
     steps = image.sensor.width // segmenter.sensor.width
     of_class = torch.zeros(1, NUM_CLASSES, image.sensor.height, image.sensor.width)
     for first in range(steps):
         part = (..., slice(first, None, steps))
         some = image.mapped(itemgetter(part), segmenter.sensor)
         of_class[part] = segmenter.probabilities(some, mirrored=first % 2 == 1).cpu()
-    image = image.to("cpu")
-    return with_likeliest(image, mean_over_columns(of_class, image.range_m, steps // 2))
+    return mean_over_columns(of_class, image.range_m.cpu(), steps // 2)
 
 
 def mean_over_columns(

@@ -36,6 +36,8 @@ class SensorSetup(Settings):
         split_exponent: exponent of the share of a split beam that lies on the surface that is heard, by which its power
             is multiplied; at 0 each surface answers with its own part of the light alone.
         glass_passes: share of the light that goes through a pane, which depends on the wavelength.
+        glass_scatters: factor on the light that panes scatter back, as their dust does: 1 as an HDL-64E hears them,
+            which is hardly ever; some 40 for sensors from whose scans the windows of cars are not missing.
         reflectance_scale: factor on all reflectances: makers scale them as they like.
         reflectance_power: exponent of all reflectances before that factor: 1 for the units of the materials, in which
             KITTI's HDL-64E reads; above 1 for makers whose scale has more contrast.
@@ -57,6 +59,7 @@ class SensorSetup(Settings):
     pulse_length_m: Annotated[float, Bounds(above=0, most=10)] = 0.75
     split_exponent: Annotated[float, Bounds(0, 64)] = 0.0
     glass_passes: Share = 0.2
+    glass_scatters: Annotated[float, Bounds(0, 1000)] = 1.0
     reflectance_scale: Annotated[float, Bounds(0.01, 10)] = 1.0
     reflectance_power: Annotated[float, Bounds(0.5, 4)] = 1.0
     weak_dimming: Share = 1.0
@@ -102,4 +105,5 @@ class SensorSetup(Settings):
             reflectance_scale=float(np.exp(rng.uniform(np.log(0.2), 0))),
             height_m=float(rng.uniform(1.6, 2.2)),
             weak_dimming=float(rng.uniform(0, 1)),
+            glass_scatters=float(np.exp(rng.uniform(0, np.log(40)))),
         )

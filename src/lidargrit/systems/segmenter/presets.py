@@ -15,7 +15,7 @@ PRESETS = {
             LATER_STAGE,
             scans=8000,
             batch_size=4,
-            augmentations=("flip",),
+            augmentations=("flip", "paste"),
             average_over_scans=300,
             validation_scans=32,
         ),
