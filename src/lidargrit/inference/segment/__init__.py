@@ -1,5 +1,6 @@
 """A segmenter and range images → their labels, also where the images have more columns than the segmenter's sensor."""
 
+import itertools
 import math
 from operator import itemgetter
 
@@ -59,9 +60,9 @@ def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
 def class_probabilities(segmenter: Segmenter, image: RangeImage) -> Float[Tensor, "1 19 H W"]:
     """Return the probability of each of the benchmark's classes at every return, in the computer's memory.
 
-    Of n times the segmenter's columns every n-th make an image that it knows: n such images are labelled one by one,
-    every second one as its mirror image. A segmenter does not see at which azimuth a column lies, so it does not
-    matter at which the first one does. Then all n vote on each return (:func:`mean_over_columns`).
+    Of n times the segmenter's columns every n-th make an image that it knows: n such images are labelled one by one.
+    A segmenter does not see at which azimuth a column lies, so it does not matter at which the first one does. Then
+    all n vote on each return: it gets the mean over the returns of about its range in n columns and three rows.
 
     Args:
         segmenter: segmenter of a run.
@@ -72,25 +73,28 @@ def class_probabilities(segmenter: Segmenter, image: RangeImage) -> Float[Tensor
     for first in range(steps):
         part = (..., slice(first, None, steps))
         some = image.mapped(itemgetter(part), segmenter.sensor)
-        of_class[part] = segmenter.probabilities(some, mirrored=first % 2 == 1).cpu()
-    return mean_over_columns(of_class, image.range_m.cpu(), steps // 2)
+        of_class[part] = segmenter.probabilities(some).cpu()
+    return of_class if steps == 1 else _mean_over_surface(of_class, image.range_m.cpu(), 1, steps // 2)
 
 
-def mean_over_columns(
-    of_class: Float[Tensor, "B C H W"], range_m: Float[Tensor, "B H W"], columns: int
+def _mean_over_surface(
+    of_class: Float[Tensor, "B C H W"], range_m: Float[Tensor, "B H W"], rows: int, columns: int
 ) -> Float[Tensor, "B C H W"]:
-    """Return the mean of values over the returns of a row that lie about as far away, for each return.
+    """Return the mean of values over the neighbours of each return that lie about as far away, itself among them.
 
     Args:
         of_class: values of every pixel.
         range_m: range of the returns, 0 where nothing returned.
+        rows: number of rows above and below that count.
         columns: number of columns to either side that count; the last column is beside the first.
     """
     total, count = torch.zeros_like(of_class), torch.zeros_like(range_m)
     within_m = _SAME_SURFACE_M + _SAME_SURFACE_PER_RANGE * range_m
-    for step in range(-columns, columns + 1):
-        other_m = range_m.roll(step, -1)
-        same = ((other_m > 0) & ((other_m - range_m).abs() < within_m)).to(of_class.dtype)
-        total += of_class.roll(step, -1) * same[:, None]
+    above = torch.arange(range_m.shape[-2])
+    for down, right in itertools.product(range(-rows, rows + 1), range(-columns, columns + 1)):
+        other_m = range_m.roll((down, right), (-2, -1))
+        inside = ((above - down >= 0) & (above - down < len(above)))[:, None]
+        same = (inside & (other_m > 0) & ((other_m - range_m).abs() < within_m)).to(of_class.dtype)
+        total += of_class.roll((down, right), (-2, -1)) * same[:, None]
         count += same
     return total / count.clamp(min=1)[:, None]

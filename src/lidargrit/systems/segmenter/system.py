@@ -176,7 +176,8 @@ def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"])
 
 def with_likeliest(images: RangeImage, of_class: Float[Tensor, "B 19 H W"]) -> RangeImage:
     """Return images whose label is the likeliest class of each return, by SemanticKITTI's numbers."""
-    return images.with_planes(label=torch.where(images.return_mask, labels_of(of_class.argmax(1) + 1), 0))
+    label = labels_of(of_class.argmax(1) + 1).to(images.range_m.device)
+    return images.with_planes(label=torch.where(images.return_mask, label, 0))
 
 
 @dataclass(frozen=True)
@@ -222,26 +223,22 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
         Args:
             images: batch of range images (B, H, W); labels that they have are not read.
         """
-        return RangeImage.cat([with_likeliest(image, self.probabilities(image)) for image in one_by_one(images)])
+        each = one_by_one(images)
+        return RangeImage.cat(
+            [with_likeliest(image, self.probabilities(image).to(image.range_m.device)) for image in each]
+        )
 
     @inference()
-    def probabilities(self, images: RangeImage, mirrored: bool = False) -> Float[Tensor, "B 19 H W"]:
-        """Return the probability of each of the benchmark's classes at every pixel, on the images' device.
+    def probabilities(self, images: RangeImage) -> Float[Tensor, "B 19 H W"]:
+        """Return the probability of each of the benchmark's classes at every pixel, on the generator's device.
 
         Args:
             images: batch of range images (B, H, W), each computed by itself.
-            mirrored: whether the network sees their mirror images, left and right exchanged.
         """
         check_images(images, self.sensor)
         self.eval()
-        found = list[Tensor]()
-        for image in one_by_one(images.to(self.device)):
-            seen = [image.range_m, image.reflectance]
-            if mirrored:
-                seen = [None if each is None else each.flip(-1) for each in seen]
-            of_class = self.segmenter(*seen).softmax(1)
-            found.append(of_class.flip(-1) if mirrored else of_class)
-        return torch.cat(found).to(images.range_m.device)
+        each = one_by_one(images.to(self.device))
+        return torch.cat([self.segmenter(image.range_m, image.reflectance).softmax(1) for image in each])
 
     def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of labelling one scan, counted while it is computed."""
