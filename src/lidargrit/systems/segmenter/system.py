@@ -223,10 +223,7 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
         Args:
             images: batch of range images (B, H, W); labels that they have are not read.
         """
-        each = one_by_one(images)
-        return RangeImage.cat(
-            [with_likeliest(image, self.probabilities(image).to(image.range_m.device)) for image in each]
-        )
+        return RangeImage.cat([with_likeliest(image, self.probabilities(image)) for image in one_by_one(images)])
 
     @inference()
     def probabilities(self, images: RangeImage) -> Float[Tensor, "B 19 H W"]:
