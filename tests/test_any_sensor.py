@@ -11,7 +11,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.batches import Batches
-from lidargrit.data.images import RangeImages
+from lidargrit.data.images import Pixels, RangeImages
 from lidargrit.generation.generator import load
 from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
@@ -150,6 +150,15 @@ def test_noise_that_a_sensor_learned_decays_by_degrees_on_another() -> None:
     assert math.degrees(COLUMN_RAD) == 360 / 256
 
 
+class LabelledImages(SeededImages):
+    """The same with labels: cars at every third pixel, a building elsewhere."""
+
+    def read(self, index: int) -> Pixels:
+        range_m = super().read(index).range_m
+        label = np.where(np.arange(range_m.size).reshape(range_m.shape) % 3, 50, 10)
+        return Pixels(range_m, {"label": label.astype(np.int64)})
+
+
 def test_drawn_sensors_are_within_the_bounds_and_follow_from_their_seed() -> None:
     sensors = [load_sensor(f"drawn_{seed}") for seed in range(120)]
     for sensor in sensors:
@@ -179,6 +188,17 @@ def test_a_batch_is_of_one_sensor_and_each_image_comes_once() -> None:
     resumed = [one.images.range_m for one in batches.stream(4, 20)]
     assert all(map(torch.equal, resumed, [one.range_m for one in seen[2:]]))
     assert images.alike([0, 1, 2, 5, 6], 2) == [[0, 1], [2], [5, 6]]
+    labelled = [RangeImages(sensor, [LabelledImages(sensor, 4)]) for sensor in (EVEN, ODD)]
+    pasting = Batches(RangeImages.joined(None, labelled), 2, ("paste",), any_columns=False, seed=3)
+    pasted = [batch.images for batch in pasting.stream(0, 8)]
+    own = {float(each) for index in range(4) for each in LabelledImages(EVEN, 4).read(index).range_m.flatten()}
+    own |= {float(each) for index in range(4) for each in LabelledImages(ODD, 4).read(index).range_m.flatten()}
+    assert {float(each) for one in pasted for each in one.range_m.flatten()} < own
+    fresh = Batches(RangeImages.joined(None, labelled), 2, (), any_columns=False, seed=3)
+    assert any(not torch.equal(one.range_m, fresh.at(2 * at).images.range_m) for at, one in enumerate(pasted))
+    halves = [Batches(RangeImages.joined(None, labelled), 2, ("paste",), False, 3, rank, 2) for rank in (0, 1)]
+    for at, one in enumerate(pasted):
+        assert torch.equal(torch.cat([half.at(2 * at).images.range_m for half in halves]), one.range_m)
     with pytest.raises(ConfigError, match="fewer scans of each of 2 sensors"):
         Batches(images, 8, (), any_columns=False, seed=3)
 

@@ -87,6 +87,11 @@ def test_a_set_up_is_the_sensors_own_or_the_packages_or_sampled():
     sampled = [setup_of(load_sensor("os1_128"), np.random.default_rng(seed)) for seed in (1, 1, 2)]
     assert sampled[0] == sampled[1] != sampled[2]
     assert len(sampled[0].offset_m) == 128
+    rng = np.random.default_rng(5)
+    assert 1 < SensorSetup.sample(rng, 16).glass_scatters < 40
+    assert rng.random() == 0.5070681389233913  # as before panes could scatter, so that the rest of a street stays
+    drawn = load_sensor("drawn_5")  # made anew
+    assert (drawn.range_max_m, drawn.setup.height_m) == pytest.approx((51.843, 1.426), abs=1e-3)
     for seed in range(200):
         SensorSetup.sample(np.random.default_rng(seed), 16)  # refuses itself out of its bounds
     heights_m = [observe(seed, load_sensor("vlp16"), frame=frame).sensor_pose[2, 3] for seed, frame in ((4, 0), (4, 1))]

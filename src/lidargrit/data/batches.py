@@ -111,18 +111,18 @@ class Batches:
             gaps = [self._pasts.random_gap(index, rng) for index, rng in zip(indices, rngs, strict=True)]
             example = replace(example, condition=self._pasts.of(indices, first_columns, gaps))
         if self.augmentations:
-            another = [partial(self._another, index, rng) for index, rng in zip(indices, rngs, strict=True)]
+            another = [partial(self._another, *each) for each in zip(indices, columns, rngs, strict=True)]
             each = [augment(example[i : i + 1], self.augmentations, rngs[i], another[i]) for i in range(len(rngs))]
             example = Example.cat(each)
         if self._condition_of is not None and self._pasts is None:
             example = replace(example, condition=self._condition_of(example.images))
         return example.with_keys() if self._with_keys else example
 
-    def _another(self, index: int, rng: torch.Generator) -> RangeImage:
-        """Read any image of the sensor of one of the images, as a batch of one."""
+    def _another(self, index: int, first_column: int, rng: torch.Generator) -> RangeImage:
+        """Read any image of the sensor of one of the images, with its first column, as a batch of one."""
         alike = next(each for each in self._by_sensor if len(self._by_sensor) == 1 or index in each)
         chosen = alike[int(torch.randint(len(alike), (1,), generator=rng))]
-        return self.images.batch([chosen])
+        return self.images.batch([chosen], [first_column] if self.any_columns else None)
 
     def _scan_at(self, position: int) -> int:
         epoch, index = divmod(position, self._epoch_length)

@@ -101,10 +101,7 @@ def scores_of_model(generator: Generator, simulated: SimulatedScans, real: Range
 
     The clean ranges of real scans are interpolated, and decoded if the model has a tokenizer.
     """
-    if not generator.sensor.same_rays(real.sensor):
-        raise ConfigError(
-            f"a model of {generator.sensor.name!r}", f"one of {real.sensor.name!r}", "name a model of the scans' sensor"
-        )
+    generator = generator.for_sensor(real.sensor).to(generator.device)
     true = real.batch(range(len(real)))
     pairs = {"simulated": (simulated.clean, simulated.measured)}
     if "encode" in generator.capabilities:

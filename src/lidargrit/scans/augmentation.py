@@ -45,8 +45,8 @@ def augment(
         another: function that reads another batch of as many images of the same sensor, for ``paste``.
 
     Raises:
-        ConfigError: a geometric change of a scan with a past, whose rays would no longer be those of its sensor; or
-            ``paste`` of scans without labels.
+        ConfigError: another change than ``flip`` or ``roll`` of a scan with a past; or ``paste`` of scans without
+            labels, or without ``another``.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.2.2 (the paper gives no numbers); numbers from the program,
@@ -61,7 +61,6 @@ def augment(
         elif isinstance(example.condition, Past):
             raise ConfigError(f"the augmentation {kind} of scans with a past", "flip or roll", "leave it out")
         elif kind == "paste":
-            assert another is not None, "another scan"
             example = replace(example, images=_paste(example.images, another, rng))
         else:
             change = _geometric if kind == "geometric" else _geometric_reference
@@ -91,9 +90,11 @@ def _roll(example: Example, rng: torch.Generator) -> Example:
     return Example(images.mapped(lambda pixels: pixels.gather(-1, column)), condition)
 
 
-def _paste(images: RangeImage, another: Callable[[], RangeImage], rng: torch.Generator) -> RangeImage:
+def _paste(images: RangeImage, another: Callable[[], RangeImage] | None, rng: torch.Generator) -> RangeImage:
     if images.label is None:
         raise ConfigError("the augmentation paste of scans without labels", "scans with labels", "leave it out")
+    if another is None:
+        raise ConfigError("the augmentation paste of scans alone", "other scans to paste from", "leave it out")
     chosen = _coin(images, rng)
     if not chosen.any():
         return images

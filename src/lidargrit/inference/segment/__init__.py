@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import locate
-from lidargrit.generation.batches import one_by_one
+from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.generator import load
 from lidargrit.generation.semantic_classes import NUM_CLASSES
 from lidargrit.nn.devices import usable_device
@@ -53,6 +53,7 @@ def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
         segmenter: segmenter of a run.
         images: batch of range images (B, H, W) for which :func:`can_label` holds.
     """
+    check_images(images, images.sensor)
     labelled = [with_likeliest(image.to("cpu"), class_probabilities(segmenter, image)) for image in one_by_one(images)]
     return RangeImage.cat(labelled)
 
@@ -62,7 +63,8 @@ def class_probabilities(segmenter: Segmenter, image: RangeImage) -> Float[Tensor
 
     Of n times the segmenter's columns every n-th make an image that it knows: n such images are labelled one by one.
     A segmenter does not see at which azimuth a column lies, so it does not matter at which the first one does. Then
-    all n vote on each return: it gets the mean over the returns of about its range in n columns and three rows.
+    all n vote on each return: it gets the mean over the returns of about its range in its row, the one above and the
+    one below, in its column and the n // 2 to either side. A pixel without a return has any values.
 
     Args:
         segmenter: segmenter of a run.

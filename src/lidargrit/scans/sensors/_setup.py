@@ -36,8 +36,8 @@ class SensorSetup(Settings):
         split_exponent: exponent of the share of a split beam that lies on the surface that is heard, by which its power
             is multiplied; at 0 each surface answers with its own part of the light alone.
         glass_passes: share of the light that goes through a pane, which depends on the wavelength.
-        glass_scatters: factor on the light that panes scatter back, as their dust does: 1 as an HDL-64E hears them,
-            which is hardly ever; some 40 for sensors from whose scans the windows of cars are not missing.
+        glass_scatters: factor on the light that panes scatter back, as their dust does: 1 for an HDL-64E, to which
+            panes hardly ever return; some 40 for sensors from whose scans the windows of cars are not missing.
         reflectance_scale: factor on all reflectances: makers scale them as they like.
         reflectance_power: exponent of all reflectances before that factor: 1 for the units of the materials, in which
             KITTI's HDL-64E reads; above 1 for makers whose scale has more contrast.
@@ -90,6 +90,9 @@ class SensorSetup(Settings):
         Args:
             height: number of rows.
         """
+        bits = rng.bit_generator
+        assert isinstance(bits, np.random.PCG64)
+        aside = np.random.Generator(bits.jumped())  # numbers that the stream itself does not lose
         gain_spread, offset_spread_m = rng.uniform(0, 0.31), rng.uniform(0, 0.025)
         return cls(
             range_sigma_m=float(rng.uniform(0.004, 0.02)),
@@ -105,5 +108,5 @@ class SensorSetup(Settings):
             reflectance_scale=float(np.exp(rng.uniform(np.log(0.2), 0))),
             height_m=float(rng.uniform(1.6, 2.2)),
             weak_dimming=float(rng.uniform(0, 1)),
-            glass_scatters=float(np.exp(rng.uniform(0, np.log(40)))),
+            glass_scatters=float(np.exp(aside.uniform(0, np.log(40)))),
         )

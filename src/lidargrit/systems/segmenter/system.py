@@ -223,6 +223,7 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
         Args:
             images: batch of range images (B, H, W); labels that they have are not read.
         """
+        check_images(images, self.sensor)
         return RangeImage.cat([with_likeliest(image, self.probabilities(image)) for image in one_by_one(images)])
 
     @inference()

@@ -11,7 +11,7 @@ from lidargrit.scans.sensors import load_sensor
 
 STREETS_VERSION = 4
 """Version of what a seed makes; recordings tell it. 2 has set-ups of sensors; 3 has streets that bend and end;
-4 is 3 with windows that return to sensors more sensitive than KITTI's, for which both are equal."""
+4 differs from 3 in glass, which returns to some sensors; for KITTI's both are equal."""
 _SEEDS_APART = 1_000_000  # distance between the splits' first seeds, and so the largest count
 
 
