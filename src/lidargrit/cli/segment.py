@@ -9,7 +9,7 @@ from lidargrit.core.errors import counted_scans
 
 EXAMPLES = """\
   lidargrit segment /data/scans labelled                 a KITTI tree with labels/NNNNNN.label
-  lidargrit view labelled -o labelled.html               look at it, coloured by class
+  lidargrit view labelled -o labelled.html               look at it; colour by label
   lidargrit segment /data/scans labelled --model runs/mine
   lidargrit segment simulated:16:val labelled --compare semantic_kitti       how well it finds their own labels
 """
