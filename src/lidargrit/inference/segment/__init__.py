@@ -5,6 +5,7 @@ import math
 from operator import itemgetter
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -91,12 +92,18 @@ def _mean_over_surface(
         columns: number of columns to either side that count; the last column is beside the first.
     """
     total, count = torch.zeros_like(of_class), torch.zeros_like(range_m)
+    around_m, values = (_with_border(each, rows, columns) for each in (range_m[:, None], of_class))
     within_m = _SAME_SURFACE_M + _SAME_SURFACE_PER_RANGE * range_m
-    above = torch.arange(range_m.shape[-2])
-    for down, right in itertools.product(range(-rows, rows + 1), range(-columns, columns + 1)):
-        other_m = range_m.roll((down, right), (-2, -1))
-        inside = ((above - down >= 0) & (above - down < len(above)))[:, None]
-        same = (inside & (other_m > 0) & ((other_m - range_m).abs() < within_m)).to(of_class.dtype)
-        total += of_class.roll((down, right), (-2, -1)) * same[:, None]
+    height, width = range_m.shape[-2:]
+    for row, column in itertools.product(range(2 * rows + 1), range(2 * columns + 1)):
+        window = (..., slice(row, row + height), slice(column, column + width))
+        other_m = around_m[window][:, 0]
+        same = ((other_m > 0) & ((other_m - range_m).abs() < within_m)).to(of_class.dtype)
+        total.addcmul_(values[window], same[:, None])
         count += same
     return total / count.clamp(min=1)[:, None]
+
+
+def _with_border(pixels: Float[Tensor, "B C H W"], rows: int, columns: int) -> Float[Tensor, "B C G V"]:
+    """Return pixels with zeros above and below, and to either side the columns of the other end."""
+    return F.pad(F.pad(pixels, (columns, columns, 0, 0), mode="circular"), (0, 0, rows, rows))
