@@ -22,12 +22,10 @@ from lidargrit.core.table import Table
 from lidargrit.data.sources import open_images
 from lidargrit.generation.semantic_classes import NUM_CLASSES, labels_of
 from lidargrit.inference.segment import class_probabilities, open_segmenter
-from lidargrit.inference.segment.command import GROUPS
-from lidargrit.scans.classes import CLASSES, as_semantic_kitti
+from lidargrit.inference.segment.command import GROUP_OF_NUMBER, GROUPS
+from lidargrit.scans.classes import as_semantic_kitti
 
 _BINS = 10
-_INDEX = {number: GROUPS.index(each.group) + 1 if each.group else 0 for number, each in CLASSES.items()}
-_OF_NUMBER = torch.tensor([_INDEX.get(number, 0) for number in range(max(CLASSES) + 1)])
 
 
 def main() -> None:
@@ -53,14 +51,14 @@ def _labelled(run: str, scans: str, numbering: str) -> Iterator[tuple[Float[Tens
     """Yield the probability of each group of classes (0 is none), the true group, and where rays returned."""
     segmenter = open_segmenter(run)
     images = open_images(scans, segmenter.sensor.fine())
-    group_of_class = _OF_NUMBER[labels_of(torch.arange(1, NUM_CLASSES + 1))]
+    group_of_class = GROUP_OF_NUMBER[labels_of(torch.arange(1, NUM_CLASSES + 1))]
     for index in range(len(images)):
         image = images.batch([index])
         assert image.label is not None, "scans with labels"
         of_class = class_probabilities(segmenter, image)[0]
         of_group = torch.zeros(len(GROUPS) + 1, *of_class.shape[1:]).index_add(0, group_of_class, of_class)
         returned = image.return_mask[0]
-        true = _OF_NUMBER[as_semantic_kitti(image.label.where(image.return_mask, 0), numbering)[0].long()]
+        true = GROUP_OF_NUMBER[as_semantic_kitti(image.label.where(image.return_mask, 0), numbering)[0].long()]
         yield of_group, true.where(returned, 0), returned
 
 

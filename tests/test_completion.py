@@ -294,8 +294,10 @@ def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
     assert [score.own.metric for score in scores] == list(RAYDROP_CURVES)
     assert all(score.real_against_real.value < 1e-3 < min(score.own.value, score.bernoulli.value) for score in scores)
     assert [row[0] for row in tables(scores)[0].rows] == ["scans compared", *RAYDROP_CURVES]
-    decoded, same = decoded_surfaces(model, open_images(f"{folders}/scans", SENSOR))
-    returns = same.return_mask.any(0)
+    scans = open_images(f"{folders}/scans", SENSOR)
+    measured = scans.batch(range(len(scans)))
+    decoded = decoded_surfaces(model, measured)
+    returns = measured.return_mask.any(0)
     assert bool(returns.any())
     assert all(torch.equal(mask, returns) for mask in decoded.return_mask)
     with pytest.raises(ConfigError, match="which drops no returns of clean scans"):

@@ -105,25 +105,24 @@ def scores_of_model(generator: Generator, simulated: SimulatedScans, real: Range
     true = real.batch(range(len(real)))
     pairs = {"simulated": (simulated.clean, simulated.measured)}
     if "encode" in generator.capabilities:
-        pairs["real"] = decoded_surfaces(generator, real)
+        pairs["real"] = decoded_surfaces(generator, true), true
     pairs["real_triangulated"] = triangulated_surfaces(true), true
     return [score for scans, (clean, of) in pairs.items() for score in score_raydrop(generator, scans, clean, of)]
 
 
 @torch.no_grad()
-def decoded_surfaces(generator: Generator, real: RangeImages) -> tuple[RangeImage, RangeImage]:
-    """Return scans with a decoded range for every ray, and the original scans.
+def decoded_surfaces(generator: Generator, true: RangeImage) -> RangeImage:
+    """Return scans with a range for every ray, decoded by the tokenizer of their sensor's model.
 
     A ray that never returns in any of the scans, such as one that ends on the car, has no surface.
     """
     tokenizer, sensor = generator.get_tokenizer(), generator.sensor
-    true = real.batch(range(len(real)))
     ranges = [
         tokenizer.decode(tokenizer.encode(true[index : index + 1].to(generator.device))).range_m
         for index in range(len(true))
     ]
     range_m = torch.cat(ranges).float().cpu().clamp(sensor.range_min_m, sensor.range_max_m)
-    return _surfaces(range_m, true), true
+    return _surfaces(range_m, true)
 
 
 def triangulated_surfaces(true: RangeImage) -> RangeImage:

@@ -14,6 +14,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.generator import load
 from lidargrit.generation.semantic_classes import NUM_CLASSES
+from lidargrit.nn.convolution import wrapped
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -92,7 +93,8 @@ def _mean_over_surface(
         columns: number of columns to either side that count; the last column is beside the first.
     """
     total, count = torch.zeros_like(of_class), torch.zeros_like(range_m)
-    around_m, values = (_with_border(each, rows, columns) for each in (range_m[:, None], of_class))
+    border = (0, 0, rows, rows)  # of zeros above and below
+    around_m, values = (F.pad(wrapped(each, columns, columns), border) for each in (range_m[:, None], of_class))
     within_m = _SAME_SURFACE_M + _SAME_SURFACE_PER_RANGE * range_m
     height, width = range_m.shape[-2:]
     for row, column in itertools.product(range(2 * rows + 1), range(2 * columns + 1)):
@@ -102,8 +104,3 @@ def _mean_over_surface(
         total.addcmul_(values[window], same[:, None])
         count += same
     return total / count.clamp(min=1)[:, None]
-
-
-def _with_border(pixels: Float[Tensor, "B C H W"], rows: int, columns: int) -> Float[Tensor, "B C G V"]:
-    """Return pixels with zeros above and below, and to either side the columns of the other end."""
-    return F.pad(F.pad(pixels, (columns, columns, 0, 0), mode="circular"), (0, 0, rows, rows))

@@ -24,9 +24,10 @@ from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.systems.segmenter.system import Segmenter
 
 GROUPS = tuple(group for group in get_args(Group) if group)
-_GROUP_OF = torch.zeros(max(CLASSES) + 1, dtype=torch.int64)
+GROUP_OF_NUMBER = torch.zeros(max(CLASSES) + 1, dtype=torch.int64)
+"""Group of each of SemanticKITTI's numbers, from 1 in the order of ``GROUPS``; 0 for none."""
 for _number, _class in CLASSES.items():
-    _GROUP_OF[_number] = GROUPS.index(_class.group) + 1 if _class.group else 0
+    GROUP_OF_NUMBER[_number] = GROUPS.index(_class.group) + 1 if _class.group else 0
 
 
 class LabelScores:
@@ -45,7 +46,7 @@ class LabelScores:
 
     def add(self, found: Int[Tensor, " n"], true: Int[Tensor, " n"]) -> None:
         """Count the points of a scan, of labels by SemanticKITTI's numbers."""
-        pairs = _GROUP_OF[true.long()] * len(self.counts) + _GROUP_OF[found.long()]
+        pairs = GROUP_OF_NUMBER[true.long()] * len(self.counts) + GROUP_OF_NUMBER[found.long()]
         self.counts += pairs.bincount(minlength=self.counts.numel()).view_as(self.counts)
 
     def intersection_over_union(self) -> dict[str, float]:

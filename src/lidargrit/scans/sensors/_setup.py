@@ -92,7 +92,7 @@ class SensorSetup(Settings):
         """
         bits = rng.bit_generator
         assert isinstance(bits, np.random.PCG64)
-        aside = np.random.Generator(bits.jumped())  # numbers that the stream itself does not lose
+        aside = np.random.Generator(bits.jumped())  # so that what is drawn next from rng stays what it was
         gain_spread, offset_spread_m = rng.uniform(0, 0.31), rng.uniform(0, 0.025)
         return cls(
             range_sigma_m=float(rng.uniform(0.004, 0.02)),
