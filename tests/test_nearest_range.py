@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import product
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ from lidargrit.training import train
 from tiny_runs import learn
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64, 1)
-CONFIG = NearestRangeConfig(cell_rows=8, cell_columns=4, part_rows=2, part_columns=4, width=8, blocks=1, features=4)
+CONFIG = NearestRangeConfig(cell_rows=8, cell_columns=4, part_rows=1, part_columns=4, width=8, blocks=1, features=4)
 
 PIXELS = PixelDecoderConfig(
     mask_features=2, range_features=2, mask_width=8, range_width=8, blocks=1, decoded_components=True
@@ -44,15 +45,18 @@ def test_operations_of_decoding_are_those_that_torch_counts():
 def test_features_tell_codes_apart_and_those_of_near_levels_or_of_most_parts_in_common_are_alike():
     tokenizer = NearestRangeTokenizer(replace(CONFIG, part_columns=2), SENSOR)
     features = tokenizer.code_features()
-    assert features.shape[0] == tokenizer.num_codes == 1 + 128 * 15
+    patterns = ["farther nearest", "nearest farther", "nearest nearest", "nearest dropped", "dropped nearest"]
+    assert features.shape[0] == tokenizer.num_codes == 1 + 128 * len(patterns)
     assert len(features.unique(dim=0)) == tokenizer.num_codes
     directions = features / features.norm(dim=1, keepdim=True)
 
     def alike(one, other):
-        return float(directions[1 + 15 * one[0] + one[1] - 1] @ directions[1 + 15 * other[0] + other[1] - 1])
+        codes = [1 + level * len(patterns) + patterns.index(pattern) for level, pattern in (one, other)]
+        return float(directions[codes[0]] @ directions[codes[1]])
 
-    assert alike((40, 3), (41, 3)) > alike((40, 3), (44, 3)) > alike((40, 3), (90, 3))
-    assert alike((40, 0b0111), (40, 0b0011)) > alike((40, 0b0111), (40, 0b1000))
+    near = "nearest nearest"
+    assert alike((40, near), (41, near)) > alike((40, near), (44, near)) > alike((40, near), (90, near))
+    assert alike((40, near), (40, "nearest farther")) > alike((40, "dropped nearest"), (40, "nearest farther"))
     assert float((directions[1:] @ directions[0]).abs().max()) == 0  # an empty cell is like no other
 
 
@@ -73,13 +77,19 @@ def tokens_by_loop(image, config):
             for down in range(config.part_rows):
                 for right in range(config.part_columns):
                     lines = cell[down * high_of_part : (down + 1) * high_of_part]
-                    part = [r for line in lines for r in line[right * wide : (right + 1) * wide] if r > 0]
+                    rays = [r for line in lines for r in line[right * wide : (right + 1) * wide]]
+                    part = [r for r in rays if r > 0]
                     close = sum(r <= 1.07 * nearest for r in part)
-                    parts.append((close / len(part) if part else 0.0, close))
+                    parts.append((close / len(part) if part else 0.0, close, len(part) < 0.5 * len(rays)))
             most = max(range(len(parts)), key=lambda number: parts[number][0] + 1e-3 * parts[number][1])
-            pattern = sum(2**number for number, (share, _) in enumerate(parts) if share >= 0.5 or number == most)
+            states = tuple(
+                "nearest" if share >= 0.5 or number == most else "dropped" if drops else "farther"
+                for number, (share, _, drops) in enumerate(parts)
+            )
+            every = product(("farther", "nearest", "dropped"), repeat=len(parts))
+            patterns = [pattern for pattern in every if "nearest" in pattern]
             level = math.floor((math.log(nearest) - low) / (high - low) * config.levels)
-            row.append(1 + min(level, config.levels - 1) * (2 ** len(parts) - 1) + pattern - 1)
+            row.append(1 + min(level, config.levels - 1) * len(patterns) + patterns.index(states))
         found.append(row)
     return torch.tensor(found)
 

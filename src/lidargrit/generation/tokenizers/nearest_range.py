@@ -1,7 +1,8 @@
-"""Tokens that need no learning: the nearest range of each cell of pixels, and which parts of the cell are at it."""
+"""Tokens that need no learning: the nearest range of a cell, which parts of it are there, and which return nothing."""
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from typing import Annotated
 
 import torch
@@ -24,7 +25,8 @@ _CODES_AT_MOST = 65_536
 _SHIFTS = tuple((down, right) for down in (-1, 0, 1) for right in (-1, 0, 1))
 _FINEST_M, _COARSEST_M = 0.01, 40.0
 _COMPONENTS_TOLD = 4  # the likeliest, to a pixel decoder; each costs it as much as a neighbour's range
-_TOLD = 2  # features of a pixel that are not learned: whether its part, and whether its cell, is at the nearest range
+_FARTHER, _NEAREST, _DROPPED = _STATES = range(3)  # of a part of a cell
+_TOLD = 3  # features of a pixel that are not learned: its part is nearest, its cell returns, its part is dropped
 _WAVES, _BUMP_LEVELS = 16, 4  # over the levels, by which codes of near levels share weights: how many, how wide
 _HEAD_START, _OF_PART = 4.0, 4.0  # of the logit of the own cell's range, and how much a pixel's part moves it
 
@@ -64,22 +66,24 @@ class NearestRangeConfig(TokenizerConfig):
 
     @property
     def num_patterns(self) -> int:
-        """Number of sets of parts that are at the nearest range; one part always is."""
-        return 2 ** (self.part_rows * self.part_columns) - 1
+        """Number of ways in which the parts of a cell are at the nearest range, farther or dropped; one is nearest."""
+        parts = self.part_rows * self.part_columns
+        return len(_STATES) ** parts - (len(_STATES) - 1) ** parts
 
     @property
     def num_codes(self) -> int:
-        """Number of codes: every level with every pattern, and a cell without a return."""
+        """Number of codes: every level with every pattern of parts, and a cell without a return."""
         return 1 + self.levels * self.num_patterns
 
 
 class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
     """Tokens name the nearest range of their cell, so that a pole keeps its token whatever stands behind it.
 
-    A token is 0 for a cell without a return. Any other is 1 + level * patterns + pattern - 1: the level of the nearest
-    range, and a binary number of the parts of the cell of whose returns at least half lie within 7 % of it. Nothing of
-    that is learned. What is learned is to decode: each pixel has a distribution of its range whose components begin at
-    the nearest ranges of its own and of the eight cells around, and the probability of its return.
+    A token is 0 for a cell without a return. Any other is 1 + level * patterns + pattern: the level of the nearest
+    range, and of each part of the cell whether it is at it (at least half of its returns lie within 7 % of it), else
+    dropped (fewer than half of its rays return), else farther. Nothing of that is learned. What is learned is to
+    decode: each pixel has a distribution of its range whose components begin at the nearest ranges of its own and of
+    the eight cells around, and the probability of its return.
 
     A mean error lets thin things go, since they are few pixels: a VQ-VAE after as many scans keeps a third of the
     pixels of poles within 5 % of their range, these tokens keep nine tenths before anything is learned.
@@ -99,7 +103,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         self.num_features, self.num_components = config.features + _TOLD, _COMPONENTS_TOLD
         self._low, self._high = math.log(sensor.range_min_m), math.log(sensor.range_max_m)
         components = len(_SHIFTS) + 1
-        inputs = 2 + config.part_rows * config.part_columns
+        inputs = 2 + 2 * config.part_rows * config.part_columns
         self.rows = nn.Parameter(torch.zeros(config.width, self.grid_size[0], 1))
         self.conv_in = Convolution(inputs, config.width, "wrap")
         self.blocks = nn.Sequential(*(Residual(config.width) for _ in range(config.blocks)))
@@ -123,11 +127,15 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         share = number_close / number.clamp(min=1)
         # A part with the most of them is one in any case: of several that have equal shares, the one with more pixels.
         most = F.one_hot((share + 1e-3 * number_close).argmax(-1), share.shape[-1]) > 0
-        at_nearest = (share >= 0.5) | most
-        pattern = (at_nearest.long() * 2 ** torch.arange(share.shape[-1], device=share.device)).sum(-1)
+        rays_of_a_part = config.cell_rows * config.cell_columns // share.shape[-1]
+        state = torch.where(number < rays_of_a_part / 2, _DROPPED, _FARTHER)
+        state = torch.where((share >= 0.5) | most, _NEAREST, state)
+        digits = len(_STATES) ** torch.arange(share.shape[-1] - 1, -1, -1, device=state.device)
+        of_patterns = self._states(state.device)
+        pattern = torch.searchsorted((of_patterns * digits).sum(-1), (state * digits).sum(-1))
         level = ((nearest.log() - self._low) / (self._high - self._low) * config.levels).floor()
         level = level.nan_to_num(posinf=0).clamp(0, config.levels - 1).long()
-        tokens = torch.where(nearest < torch.inf, level * config.num_patterns + pattern, 0)
+        tokens = torch.where(nearest < torch.inf, 1 + level * config.num_patterns + pattern, 0)
         return TokenGrid.unchecked(tokens, self.num_codes)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
@@ -139,14 +147,13 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         return Decoded(mixture.mode(), return_logits, self.sensor, features=features, components=components)
 
     def code_features(self) -> Float[Tensor, "K F"]:
-        """Return of every code waves and bumps over its level, which parts are at the nearest range, and emptiness."""
+        """Return of every code waves and bumps over its level, the states of its parts, and emptiness."""
         config = self.config
         code = torch.arange(config.num_codes - 1)
-        level, pattern = (code // config.num_patterns)[:, None].float(), (code % config.num_patterns)[:, None] + 1
+        level, states = (code // config.num_patterns)[:, None].float(), self._states()[code % config.num_patterns]
         waves = math.pi / config.levels * level * torch.arange(1, _WAVES + 1)
         bumps = torch.exp(-0.5 * ((level - torch.arange(0, config.levels, _BUMP_LEVELS)) / _BUMP_LEVELS) ** 2)
-        parts = pattern.bitwise_right_shift(torch.arange(config.part_rows * config.part_columns)) & 1
-        of_codes = torch.cat((waves.sin(), waves.cos(), bumps, parts), 1)
+        of_codes = torch.cat((waves.sin(), waves.cos(), bumps, states == _NEAREST, states == _DROPPED), 1)
         return torch.block_diag(torch.ones(1, 1), of_codes)
 
     def decoding_flops(self) -> int:
@@ -181,6 +188,11 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
     def _size(self) -> tuple[int, int]:
         return self.sensor.height, self.sensor.width
 
+    def _states(self, device: torch.device | None = None) -> Int[Tensor, "patterns parts"]:
+        """Return the state of every part in every pattern; as numbers with a digit for each part, patterns ascend."""
+        every = product(_STATES, repeat=self.config.part_rows * self.config.part_columns)
+        return torch.tensor([states for states in every if _NEAREST in states], device=device)
+
     def _cells(self, pixels: Float[Tensor, "B H W"]) -> Float[Tensor, "B h w p q"]:
         (rows, columns), (height, width) = (self.config.cell_rows, self.config.cell_columns), self.grid_size
         return pixels.unflatten(2, (width, columns)).unflatten(1, (height, rows)).movedim(2, 3)
@@ -202,16 +214,16 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
     ) -> tuple[RangeMixture, Float[Tensor, "B H W"], Float[Tensor, "B F H W"]]:
         """Return the distribution of every range, the logits of the returns, and the features that they are read of."""
         config, returned = self.config, tokens > 0
-        level, pattern = (tokens - 1).clamp(min=0) // config.num_patterns, (tokens - 1) % config.num_patterns + 1
-        log_range = self._low + (level + 0.5) / config.levels * (self._high - self._low)
-        bits = 2 ** torch.arange(config.part_rows * config.part_columns, device=tokens.device)
-        at_nearest = (pattern[..., None] & bits > 0) & returned[..., None]
+        code = (tokens - 1).clamp(min=0)
+        log_range = self._low + (code // config.num_patterns + 0.5) / config.levels * (self._high - self._low)
+        states = self._states(tokens.device)[code % config.num_patterns].masked_fill(~returned[..., None], _FARTHER)
+        at_nearest, dropped = states == _NEAREST, states == _DROPPED
         scaled = torch.where(returned, 2 * (log_range - self._low) / (self._high - self._low) - 1, 0.0)
-        maps = torch.stack((returned.float(), scaled, *at_nearest.float().unbind(-1)), 1)
+        maps = torch.stack((returned.float(), scaled, *torch.cat((at_nearest, dropped), -1).float().unbind(-1)), 1)
         x = F.silu(self.blocks(self.conv_in(maps) + self.rows))
         cells = self.to_pixels(x).unflatten(1, (config.features, config.cell_rows, config.cell_columns))
         features = F.silu(cells.permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3))
-        told = torch.stack((self._of_pixels(at_nearest), self._of_pixels(returned[..., None])), 1) - 0.5
+        told = torch.stack([self._of_pixels(one) for one in (at_nearest, returned[..., None], dropped)], 1) - 0.5
         features = torch.cat((features, told.to(features.dtype)), 1)
         output = self.conv_out(features).float()
         return self._mixture(output[:, :-1], torch.where(returned, log_range, torch.nan)), output[:, -1], features

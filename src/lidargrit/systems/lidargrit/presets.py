@@ -212,7 +212,7 @@ PRESETS = {
         "LidarGRIT with a pixel decoder: 64x1024 in 4,096 tokens of nearest ranges, for half an hour of a GPU",
         replace(shared.WIDE_STREETS, train=("simulated:70000:train",), workers=16),
         LidarGritConfig(
-            NearestRangeConfig(cell_rows=4, cell_columns=4, part_rows=1, part_columns=4),
+            NearestRangeConfig(cell_rows=4, cell_columns=4, part_rows=2, part_columns=2),
             TransformerConfig(
                 heads=4,
                 embedding_dropout=0.0,
