@@ -80,13 +80,13 @@ def tokens_by_loop(image, config):
                     rays = [r for line in lines for r in line[right * wide : (right + 1) * wide]]
                     part = [r for r in rays if r > 0]
                     close = sum(r <= 1.07 * nearest for r in part)
-                    parts.append((close / len(part) if part else 0.0, close, len(part) < 0.5 * len(rays)))
+                    parts.append((close / len(part) if part else 0.0, close, len(part) <= 0.5 * len(rays)))
             most = max(range(len(parts)), key=lambda number: parts[number][0] + 1e-3 * parts[number][1])
             states = tuple(
-                "nearest" if share >= 0.5 or number == most else "dropped" if drops else "farther"
+                "nearest" if number == most else "dropped" if drops else "nearest" if share >= 0.5 else "farther"
                 for number, (share, _, drops) in enumerate(parts)
             )
-            every = product(("farther", "nearest", "dropped"), repeat=len(parts))
+            every = product(["farther", "nearest", "dropped"], repeat=len(parts))
             patterns = [pattern for pattern in every if "nearest" in pattern]
             level = math.floor((math.log(nearest) - low) / (high - low) * config.levels)
             row.append(1 + min(level, config.levels - 1) * len(patterns) + patterns.index(states))

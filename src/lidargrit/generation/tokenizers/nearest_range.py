@@ -80,10 +80,10 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
     """Tokens name the nearest range of their cell, so that a pole keeps its token whatever stands behind it.
 
     A token is 0 for a cell without a return. Any other is 1 + level * patterns + pattern: the level of the nearest
-    range, and of each part of the cell whether it is at it (at least half of its returns lie within 7 % of it), else
-    dropped (fewer than half of its rays return), else farther. Nothing of that is learned. What is learned is to
-    decode: each pixel has a distribution of its range whose components begin at the nearest ranges of its own and of
-    the eight cells around, and the probability of its return.
+    range, and of each part of the cell whether it is dropped (at most half of its rays return), else nearest (at least
+    half of its returns lie within 7 % of that range), else farther. The part with most of those is nearest in any case.
+    Nothing of that is learned. What is learned is to decode: each pixel has a distribution of its range whose
+    components begin at the nearest ranges of its own and of the eight cells around, and the probability of its return.
 
     A mean error lets thin things go, since they are few pixels: a VQ-VAE after as many scans keeps a third of the
     pixels of poles within 5 % of their range, these tokens keep nine tenths before anything is learned.
@@ -128,8 +128,8 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         # A part with the most of them is one in any case: of several that have equal shares, the one with more pixels.
         most = F.one_hot((share + 1e-3 * number_close).argmax(-1), share.shape[-1]) > 0
         rays_of_a_part = config.cell_rows * config.cell_columns // share.shape[-1]
-        state = torch.where(number < rays_of_a_part / 2, _DROPPED, _FARTHER)
-        state = torch.where((share >= 0.5) | most, _NEAREST, state)
+        state = torch.where(share >= 0.5, _NEAREST, _FARTHER)
+        state = torch.where(2 * number <= rays_of_a_part, _DROPPED, state).masked_fill(most, _NEAREST)
         digits = len(_STATES) ** torch.arange(share.shape[-1] - 1, -1, -1, device=state.device)
         of_patterns = self._states(state.device)
         pattern = torch.searchsorted((of_patterns * digits).sum(-1), (state * digits).sum(-1))
