@@ -108,9 +108,9 @@ def a_pole_before_a_wall():
     return RangeImage.masked(range_m, torch.ones(range_m.shape, dtype=torch.bool), SENSOR)
 
 
-@pytest.mark.parametrize(("part_rows", "part_columns"), [(1, 4), (2, 2), (4, 1)])
-def test_tokens_are_those_of_a_loop_over_cells(part_rows, part_columns):
-    config = NearestRangeConfig(8, 4, part_rows, part_columns, levels=50, width=8, blocks=1, features=4)
+@pytest.mark.parametrize("sizes", [(8, 4, 1, 4), (8, 4, 2, 2), (8, 4, 4, 1), (8, 4, 1, 1), (4, 1, 4, 1)])
+def test_tokens_are_those_of_a_loop_over_cells(sizes):
+    config = NearestRangeConfig(*sizes, levels=50, width=8, blocks=1, features=4)
     images = some_images()
     tokens = NearestRangeTokenizer(config, SENSOR).encode(images).tokens
     assert (tokens == 0).any()
@@ -120,13 +120,29 @@ def test_tokens_are_those_of_a_loop_over_cells(part_rows, part_columns):
 
 def test_every_code_is_decoded_within_the_limits_and_a_quarter_turn_turns_what_is_decoded():
     tokenizer = NearestRangeTokenizer(CONFIG, SENSOR)
-    grid = torch.arange(tokenizer.num_codes)[:128].reshape(1, *tokenizer.grid_size)
+    grid = torch.linspace(0, tokenizer.num_codes - 1, 128).long().reshape(1, *tokenizer.grid_size)
     with torch.no_grad():
         decoded = tokenizer.decode(TokenGrid(grid, tokenizer.num_codes))
         turned = tokenizer.decode(TokenGrid(grid.roll(4, 2), tokenizer.num_codes))
     assert float(decoded.range_m.min()) >= SENSOR.range_min_m * 0.999
     assert float(decoded.range_m.max()) <= SENSOR.range_max_m * 1.001
     torch.testing.assert_close(turned.range_m, decoded.range_m.roll(16, 2))
+
+
+def test_pixels_are_told_which_parts_are_nearest_and_which_are_dropped():
+    config = replace(CONFIG, part_rows=2, part_columns=2)
+    range_m = torch.full((1, SENSOR.height, SENSOR.width), 10.0)
+    range_m[:, 8:12, 6:8] = 0.0  # the upper right quarter of one cell is dropped
+    range_m[:, 20:24, 4:6] = 30.0  # and the lower left of another is farther
+    images = RangeImage.masked(range_m, range_m > 0, SENSOR)
+    tokenizer = NearestRangeTokenizer(config, SENSOR).eval()
+    with torch.no_grad():
+        features = tokenizer.decode(tokenizer.encode(images)).features
+    assert features is not None
+    nearest, returned, dropped = (features[:, -3:] + 0.5).unbind(1)
+    assert torch.equal(nearest > 0.5, range_m == 10)
+    assert torch.equal(dropped > 0.5, range_m == 0)
+    assert bool((returned > 0.5).all())
 
 
 def test_a_pole_keeps_its_range_before_anything_is_learned_whatever_stands_behind_it():
@@ -264,6 +280,7 @@ def mixture_density_by_loop(mixture):
         ({"cell_rows": 0}, "cell_rows=0"),
         ({"part_columns": 3}, "part_columns=3 of cell_columns=2"),
         ({"levels": 1}, "levels=1"),
+        ({"cell_rows": 6, "part_rows": 6, "part_columns": 1}, "levels=128 in 6 parts"),
         ({"cell_columns": 4, "part_columns": 4, "part_rows": 4}, "levels=128 in 16 parts"),
     ],
 )

@@ -18,6 +18,7 @@ import torch
 from lidargrit.core.errors import CheckpointError, OutputError, Terminated
 from lidargrit.core.files import read_json, read_tensors, write_json
 from lidargrit.data.images import RangeImages
+from lidargrit.data.run_folder import CHECKPOINT_FILE
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
@@ -70,9 +71,17 @@ def packed_in_fewer_and_fewer_bits(run, out):
 
 def test_a_run_that_travelled_in_few_bits_is_within_1_percent_100_steps_later(half, tmp_path):
     folders = packed_in_fewer_and_fewer_bits(half, tmp_path)
-    assert len(folders) == 5
+    assert len(folders) == 6
     unpack(folders[3], tmp_path / "elsewhere")  # all rounded, moments included
-    unpack(folders[4], tmp_path / "anew")  # without moments
+    unpack(folders[4], tmp_path / "unaveraged")  # moments and weights, whose average begins anew
+    unpack(folders[5], tmp_path / "anew")  # without moments
+    of_weights = {
+        name: read_tensors(tmp_path / name / "tokenizer" / CHECKPOINT_FILE)[0] for name in ("elsewhere", "unaveraged")
+    }
+    assert of_weights["elsewhere"].keys() == of_weights["unaveraged"].keys()
+    for name, tensor in of_weights["unaveraged"].items():
+        expected = of_weights["elsewhere"][name.replace("average.", "objective.", 1)]
+        assert torch.equal(tensor, expected), name
     shutil.copytree(half, tmp_path / "kept")
     kept, travelled, anew = (fit(tmp_path / name) for name in ("kept", "elsewhere", "anew"))
     assert kept.scans_seen == travelled.scans_seen == anew.scans_seen == 50

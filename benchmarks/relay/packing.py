@@ -1,9 +1,9 @@
 """The folder of a relay ⇄ a few files small enough to travel, in as many bits as fit.
 
 A stage that is still trained keeps weights, their average and the optimiser's moments; a finished one keeps its average
-alone. Where 32 bits take too much room, the moments lose bits first, then the average, then the weights. At last every
-stage keeps its average alone, which is the copy that is small enough to be committed: training goes on from it with
-fresh moments.
+alone. Where 32 bits take too much room, the moments lose bits first, then the average, then the weights. Then the
+average stays behind: it begins anew from the weights. At last every stage keeps its average alone, which is the copy
+that is small enough to be committed: training goes on from it with fresh moments.
 """
 
 import hashlib
@@ -25,13 +25,15 @@ RELAY_FILE = "relay.json"
 _PART_BYTES = 15 << 20
 _PARTS_AT_MOST = 4
 _LARGEST_HALF = 6e4  # larger numbers, such as counts, have no 16-bit float
-# Types by entries of a checkpoint, from the most bits to the fewest. Moments need the range of 32 bits, not the digits.
-_LEVELS: tuple[dict[str, torch.dtype], ...] = (
+# Types by entries of a checkpoint, from the most bits to the fewest; None leaves an entry out, others have 32 bits.
+# Moments need the range of 32 bits, not the digits.
+_LEVELS: tuple[dict[str, torch.dtype | None], ...] = (
     {},
     {"optimiser": torch.bfloat16},
     {"optimiser": torch.bfloat16, "average": torch.float16},
     {"optimiser": torch.bfloat16, "average": torch.float16, "objective": torch.float16},
-    {"average": torch.float16},
+    {"optimiser": torch.bfloat16, "average": None, "objective": torch.float16},
+    {"optimiser": None, "average": torch.float16, "objective": None},
 )
 _AVERAGE_ALONE = _LEVELS[-1]
 
@@ -63,9 +65,9 @@ def pack(run: Path, out: Path, bytes_at_most: int = _PARTS_AT_MOST * _PART_BYTES
         with atomic_path(out / name) as partial:
             partial.write_bytes(part)
     write_json(out / MANIFEST, {"parts": hashes})
-    rounded = ", ".join(f"{name} in {dtype}".replace("torch.", "") for name, dtype in types.items())
-    kept = " alone" if types is _AVERAGE_ALONE else ""
-    return f"packed {len(content) / 2**20:.1f} MiB in {len(hashes)} parts, {rounded or 'nothing rounded'}{kept}"
+    rounded = ", ".join(f"{name} in {dtype}".replace("torch.", "") for name, dtype in types.items() if dtype)
+    left_out = "".join(f", without {name}" for name, dtype in types.items() if dtype is None)
+    return f"packed {len(content) / 2**20:.1f} MiB in {len(hashes)} parts, {rounded or 'nothing rounded'}{left_out}"
 
 
 def unpack(packed: Path, run: Path) -> None:
@@ -109,7 +111,7 @@ def round_finished(module: nn.Module) -> None:
         tensor.copy_(_cast(tensor, torch.float16))
 
 
-def _tar(run: Path, finished: list[str], types: dict[str, torch.dtype]) -> bytes:
+def _tar(run: Path, finished: list[str], types: dict[str, torch.dtype | None]) -> bytes:
     buffer = io.BytesIO()
     with tempfile.TemporaryDirectory() as name, tarfile.open(fileobj=buffer, mode="w") as tar:
         for path in (run / RELAY_FILE, *sorted(run.glob(f"*/{LOG_FILE}"))):
@@ -122,11 +124,12 @@ def _tar(run: Path, finished: list[str], types: dict[str, torch.dtype]) -> bytes
     return buffer.getvalue()
 
 
-def _shortened(tensors: dict[str, Tensor], is_finished: bool, types: dict[str, torch.dtype]) -> dict[str, Tensor]:
-    if is_finished or types is _AVERAGE_ALONE:
-        types = _AVERAGE_ALONE
-        tensors = {name: tensor for name, tensor in tensors.items() if name.startswith("average.")}
-    return {name: _cast(tensor, types.get(name.partition(".")[0], torch.float32)) for name, tensor in tensors.items()}
+def _shortened(
+    tensors: dict[str, Tensor], is_finished: bool, types: dict[str, torch.dtype | None]
+) -> dict[str, Tensor]:
+    types = _AVERAGE_ALONE if is_finished else types
+    of_each = ((name, tensor, types.get(name.partition(".")[0], torch.float32)) for name, tensor in tensors.items())
+    return {name: _cast(tensor, dtype) for name, tensor, dtype in of_each if dtype is not None}
 
 
 def _cast(tensor: Tensor, dtype: torch.dtype) -> Tensor:
@@ -136,10 +139,12 @@ def _cast(tensor: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _whole(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Return a checkpoint's tensors in 32 bits; a finished stage is its average."""
+    """Return a checkpoint's tensors in 32 bits; of weights and their average, the one stands in for the other."""
     whole = {
         name: one.float() if one.dtype in (torch.float16, torch.bfloat16) else one for name, one in tensors.items()
     }
-    if not any(name.startswith("objective.") for name in whole):
-        whole |= {name.replace("average", "objective", 1): tensor.clone() for name, tensor in whole.items()}
+    for absent, present in (("objective.", "average."), ("average.", "objective.")):
+        if not any(name.startswith(absent) for name in whole):
+            stand_in = {name: tensor for name, tensor in whole.items() if name.startswith(present)}
+            whole |= {name.replace(present, absent, 1): tensor.clone() for name, tensor in stand_in.items()}
     return whole

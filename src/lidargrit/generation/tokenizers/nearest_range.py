@@ -37,7 +37,7 @@ class NearestRangeConfig(TokenizerConfig):
 
     Args:
         cell_rows: number of rows of the cell of pixels that a token stands for.
-        part_rows: number of parts into which the rows of a cell are divided.
+        part_rows: number of parts into which the rows of a cell are divided; with 128 levels a cell has at most 5.
         part_columns: number of parts into which its columns are divided.
         levels: number of different ranges, evenly apart in the logarithm between the sensor's limits.
         width: number of channels of the decoder.
@@ -81,13 +81,16 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
 
     A token is 0 for a cell without a return. Any other is 1 + level * patterns + pattern: the level of the nearest
     range, and of each part of the cell whether it is dropped (at most half of its rays return), else nearest (at least
-    half of its returns lie within 7 % of that range), else farther. The part with most of those is nearest in any case.
+    half of its returns lie within 7 % of that range), else farther. The part of whose returns the largest share lies
+    there is nearest in any case.
     Nothing of that is learned. What is learned is to decode: each pixel has a distribution of its range whose
     components begin at the nearest ranges of its own and of the eight cells around, and the probability of its return.
 
-    A mean error lets thin things go, since they are few pixels: a VQ-VAE after as many scans keeps a third of the
-    pixels of poles within 5 % of their range, these tokens keep nine tenths before anything is learned.
+    A mean error lets thin things go, since they are few pixels: a VQ-VAE after 800 scans keeps a third of the pixels of
+    poles within 5 % of their range, these tokens keep nine tenths before anything is learned.
     """
+
+    states: Tensor
 
     def __init__(self, config: NearestRangeConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -103,7 +106,10 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         self.num_features, self.num_components = config.features + _TOLD, _COMPONENTS_TOLD
         self._low, self._high = math.log(sensor.range_min_m), math.log(sensor.range_max_m)
         components = len(_SHIFTS) + 1
-        inputs = 2 + 2 * config.part_rows * config.part_columns
+        parts = config.part_rows * config.part_columns
+        every = torch.tensor([states for states in product(_STATES, repeat=parts) if _NEAREST in states])
+        self.register_buffer("states", every, persistent=False)  # of the parts in every pattern, in ascending order
+        inputs = 2 + 2 * parts
         self.rows = nn.Parameter(torch.zeros(config.width, self.grid_size[0], 1))
         self.conv_in = Convolution(inputs, config.width, "wrap")
         self.blocks = nn.Sequential(*(Residual(config.width) for _ in range(config.blocks)))
@@ -131,8 +137,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         state = torch.where(share >= 0.5, _NEAREST, _FARTHER)
         state = torch.where(2 * number <= rays_of_a_part, _DROPPED, state).masked_fill(most, _NEAREST)
         digits = len(_STATES) ** torch.arange(share.shape[-1] - 1, -1, -1, device=state.device)
-        of_patterns = self._states(state.device)
-        pattern = torch.searchsorted((of_patterns * digits).sum(-1), (state * digits).sum(-1))
+        pattern = torch.searchsorted((self.states * digits).sum(-1), (state * digits).sum(-1))
         level = ((nearest.log() - self._low) / (self._high - self._low) * config.levels).floor()
         level = level.nan_to_num(posinf=0).clamp(0, config.levels - 1).long()
         tokens = torch.where(nearest < torch.inf, 1 + level * config.num_patterns + pattern, 0)
@@ -150,7 +155,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         """Return of every code waves and bumps over its level, the states of its parts, and emptiness."""
         config = self.config
         code = torch.arange(config.num_codes - 1)
-        level, states = (code // config.num_patterns)[:, None].float(), self._states()[code % config.num_patterns]
+        level, states = (code // config.num_patterns)[:, None].float(), self.states[code % config.num_patterns]
         waves = math.pi / config.levels * level * torch.arange(1, _WAVES + 1)
         bumps = torch.exp(-0.5 * ((level - torch.arange(0, config.levels, _BUMP_LEVELS)) / _BUMP_LEVELS) ** 2)
         of_codes = torch.cat((waves.sin(), waves.cos(), bumps, states == _NEAREST, states == _DROPPED), 1)
@@ -188,11 +193,6 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
     def _size(self) -> tuple[int, int]:
         return self.sensor.height, self.sensor.width
 
-    def _states(self, device: torch.device | None = None) -> Int[Tensor, "patterns parts"]:
-        """Return the state of every part in every pattern; as numbers with a digit for each part, patterns ascend."""
-        every = product(_STATES, repeat=self.config.part_rows * self.config.part_columns)
-        return torch.tensor([states for states in every if _NEAREST in states], device=device)
-
     def _cells(self, pixels: Float[Tensor, "B H W"]) -> Float[Tensor, "B h w p q"]:
         (rows, columns), (height, width) = (self.config.cell_rows, self.config.cell_columns), self.grid_size
         return pixels.unflatten(2, (width, columns)).unflatten(1, (height, rows)).movedim(2, 3)
@@ -216,7 +216,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         config, returned = self.config, tokens > 0
         code = (tokens - 1).clamp(min=0)
         log_range = self._low + (code // config.num_patterns + 0.5) / config.levels * (self._high - self._low)
-        states = self._states(tokens.device)[code % config.num_patterns].masked_fill(~returned[..., None], _FARTHER)
+        states = self.states[code % config.num_patterns].masked_fill(~returned[..., None], _FARTHER)
         at_nearest, dropped = states == _NEAREST, states == _DROPPED
         scaled = torch.where(returned, 2 * (log_range - self._low) / (self._high - self._low) - 1, 0.0)
         maps = torch.stack((returned.float(), scaled, *torch.cat((at_nearest, dropped), -1).float().unbind(-1)), 1)
