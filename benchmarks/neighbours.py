@@ -1,12 +1,13 @@
-"""Seconds of a command on an idle machine and beside busy processes, by how its threads wait for one another.
+"""Seconds of a command on an idle machine and beside busy processes, by how its threads wait and memory is kept.
 
     python benchmarks/neighbours.py [--words "sample pretrained {out} -n {n}"] [-n 8 32] [--busy 0 1 2] [--repeats 2]
     python benchmarks/neighbours.py --words "train lidargrit_demo {out} --set training.tokenizer.scans={n}" -n 200
     python benchmarks/neighbours.py --words "demo --out {out}" -n 1 --limit 3000
 
 Each row is one way of waiting: as the command arranges it, as OpenMP does by itself (threads spin), and with one
-thread. A busy process is a Python loop that never ends. Seconds are of the whole command, its start included, the least
-of the repeats; beside them how many processors others took during it, which should be the busy processes alone.
+thread; or of keeping memory: as malloc does by itself. A busy process is a Python loop that never ends. Seconds are of
+the whole command, its start included, the least of the repeats; beside them how many processors others took during it,
+which should be the busy processes alone.
 """
 
 import argparse
@@ -22,6 +23,7 @@ WAYS = {  # name → environment variables; the command leaves what is set alrea
     "as the command arranges it": {},
     "as OpenMP does by itself": {"GOMP_SPINCOUNT": "300000"},
     "one thread": {"OMP_NUM_THREADS": "1"},
+    "malloc returns freed memory": {"MALLOC_MMAP_MAX_": "65536"},
 }
 
 
@@ -45,7 +47,7 @@ def busy_jiffies() -> int:
 
 def timed(python: str, words: list[str], environment: dict[str, str], limit_s: float) -> tuple[float, float, float]:
     """Return the seconds of a command, at most the limit, those of its processors, and the processors others took."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_", "MALLOC_"))}
     begun, before, used = time.monotonic(), busy_jiffies(), os.times()
     with suppress(subprocess.TimeoutExpired):
         subprocess.run(

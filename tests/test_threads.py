@@ -1,6 +1,7 @@
-"""Threads that wait for one another: they sleep in the command, and where they do not, small steps are not shared."""
+"""What the command arranges: threads sleep while they wait for one another, and freed memory is used again."""
 
 import os
+import platform
 import subprocess
 import sys
 
@@ -24,6 +25,18 @@ print(loaded, *(os.environ.get(name, "unset") for name in ("OMP_WAIT_POLICY", "G
 """
 
 
+FAULTS = """
+import resource
+from lidargrit.cli import main
+main(["list", "presets"])
+length = 27
+b"x" * (1 << length)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+b"x" * (1 << length)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
 def waiting_in_the_command(before="", **variables):
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("OMP_", "GOMP_"))}
     program = [sys.executable, "-c", ASK.format(before=before)]
@@ -42,6 +55,18 @@ def test_what_the_user_has_set_stays():
 
 def test_a_program_that_has_loaded_torch_keeps_its_environment():
     assert waiting_in_the_command("import torch") == ["True", "unset", "unset"]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep memory by rules of their own")
+def test_the_command_uses_freed_memory_again_unless_the_user_sets_what_malloc_keeps():
+    def page_faults(**variables):
+        kept = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+        program = [sys.executable, "-c", FAULTS]
+        answer = subprocess.run(program, env=kept | variables, capture_output=True, text=True, check=True, timeout=60)
+        return int(answer.stdout.split()[-1])
+
+    assert page_faults() < 1000  # 128 MiB are 32,768 pages of 4 KiB
+    assert page_faults(MALLOC_MMAP_MAX_="65536") > 30_000
 
 
 @pytest.mark.parametrize(("policy", "width", "expected"), [("", 16, 1), ("PASSIVE", 16, 3), ("ACTIVE", 1024, 3)])
