@@ -14,6 +14,7 @@ from lidargrit.data import drives
 from lidargrit.data.datasets import data_set_and_split, open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.export import export_scans
+from lidargrit.data.sources import open_source
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
 
@@ -159,6 +160,7 @@ def test_streets_seen_once_share_a_sequence_and_the_command_writes_them(tmp_path
     words = ["simulate", str(tmp_path / "out"), "-n", "2", "--sensor", str(tmp_path / "sensor.json"), "--workers", "1"]
     assert main(words) == 0
     assert "2 scans in" in capsys.readouterr().out
+    assert open_source(str(tmp_path / "out")).sensor.same_rays(SENSOR)  # which the tree itself does not tell
     dataset = open_dataset(str(tmp_path / "out"))
     assert [dataset.name(index) for index in range(2)] == ["00/000000", "00/000001"]
     assert np.allclose(np.loadtxt(tmp_path / "out" / "sequences" / "00" / "poses.txt"), np.eye(4)[:3].ravel())

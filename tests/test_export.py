@@ -13,12 +13,13 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError, UnknownNameError
 from lidargrit.data.datasets import open_dataset
+from lidargrit.data.datasets.shared.files import SENSOR_FILE
 from lidargrit.data.export import MANIFEST, export_scans
 from lidargrit.data.formats import read_scan
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.scan_folder import KittiTree
-from lidargrit.data.sources import open_images
+from lidargrit.data.sources import open_images, open_source
 from lidargrit.scans.motion import Motion
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
@@ -77,12 +78,12 @@ def by_library(path):
 
 
 def test_an_export_that_was_killed_leaves_nothing_half_written(samples, tmp_path):
-    """Killed when its list and its first scan are written, and its second has no name yet."""
+    """Killed when its list, its sensor and its first scan are written, and its second has no name yet."""
     words = ["export", str(samples), str(tmp_path / "tree"), "--format", "kitti_odometry"]
     child = os.fork()
     if not child:
         calls = iter(range(9))
-        os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == 2 else None
+        os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL) if next(calls) == 3 else None
         os._exit(main(words))
     assert os.waitpid(child, 0)[1] == signal.SIGKILL
     assert [path.suffix for path in (tmp_path / "tree").rglob("*") if path.is_file()].count(".partial") == 1
@@ -96,7 +97,7 @@ def test_an_export_that_was_killed_leaves_nothing_half_written(samples, tmp_path
 def test_other_libraries_and_we_read_the_points_of_samples(samples, tmp_path, kind):
     assert export_scans(str(samples), tmp_path / "out", kind) == 2
     images = open_images(str(samples))
-    files = sorted(path for path in (tmp_path / "out").iterdir() if path.name != MANIFEST)
+    files = sorted(path for path in (tmp_path / "out").iterdir() if path.name not in (MANIFEST, SENSOR_FILE))
     assert [path.stem for path in files] == ["000000", "000001"]
     for index, path in enumerate(files):
         wanted = unproject(images.batch([index])[0])
@@ -181,7 +182,7 @@ def test_fewer_scans_have_the_names_that_they_have_among_all(kind, tmp_path):
             np.save(source / f"{index:06d}.npy", range_m[:, ::8].numpy())
     whole = {name: of for name, of in contents_of_export(source, tmp_path / "whole", 0).items() if name != MANIFEST}
     some = contents_of_export(source, tmp_path / "out", 2)
-    assert sorted(some) == ["000000.bin", "000002.bin", MANIFEST]
+    assert sorted(some) == ["000000.bin", "000002.bin", MANIFEST, SENSOR_FILE]
     assert some["000002.bin"] == whole["000002.bin"]
     assert contents_of_export(source, tmp_path / "out", 0).keys() == {*whole, MANIFEST}
 
@@ -201,7 +202,8 @@ def test_the_same_command_goes_on_and_adds(samples, tmp_path):
     assert export_scans(str(samples), out, "ply", DataConfig(max_scans=1)) == 1
     assert len(read_scan(out / "000000.ply")) > 1000
     assert len(json.loads((out / MANIFEST).read_text(encoding="utf-8"))["scans"]) == 2
-    assert sorted(path.name for path in out.iterdir()) == ["000000.ply", "000001.ply", MANIFEST]
+    assert sorted(path.name for path in out.iterdir()) == ["000000.ply", "000001.ply", MANIFEST, SENSOR_FILE]
+    assert open_source(str(out)).sensor.same_rays(open_images(str(samples)).sensor)
 
 
 def test_what_is_not_ours_is_left_alone(samples, tmp_path):

@@ -20,6 +20,7 @@ from lidargrit.inference.drives import continued, path_of, write_drives
 from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 from test_forecaster import SENSOR, forecaster, street
 
@@ -72,6 +73,7 @@ def test_a_drive_that_was_stopped_goes_on_to_the_same_files(run, tmp_path):
     assert [*files(tmp_path / "verb").values()] == [files(tmp_path / "whole")["sequences/01/velodyne/000000.bin"]]
     opened = open_dataset(f"kitti_odometry:{tmp_path / 'whole'}:01")
     assert opened.origin_of(opened.root) == ""
+    assert load_sensor(opened.sensor).same_rays(forecaster().sensor)
     motion = opened.motion(2)
     assert motion.time_s == pytest.approx(0.2)
     assert motion.pose is not None

@@ -13,6 +13,7 @@ from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.export import export_scans
+from lidargrit.data.sources import open_source
 from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.types import Scan
 
@@ -107,6 +108,7 @@ def test_the_verb_writes_scans_that_are_read_back_and_goes_on_where_it_was_stopp
     assert main(words) == 0
     assert len(sorted(out.glob("**/*.ply"))) == 2
     assert json.loads((out / "export.json").read_text())["to"]["name"] == "vlp16"
+    assert open_source(str(out)).sensor.name == "vlp16"
     assert main([*words[:-1], "pcd"]) == 2, "the folder is of another command"
     assert "choose another folder" in capsys.readouterr().err
 

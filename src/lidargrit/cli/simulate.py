@@ -40,5 +40,4 @@ def run(options: argparse.Namespace) -> None:
     settings = {name: vars(options)[name] for name in ("seed", "frames", "theme", "motion", "wet", "clean")}
     config = DriveConfig(load_sensor(options.sensor), **settings)
     there = write_drives(options.out, options.count, config, options.workers, options.ray)
-    theirs = f", with the sensor {options.sensor}" if options.sensor != _SENSOR else ""
-    print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}{theirs}")
+    print(f"{counted_scans(there)} in {options.out}: read them as kitti_odometry:{options.out}")

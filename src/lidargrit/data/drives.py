@@ -17,6 +17,7 @@ from lidargrit.core.files import (
     write_json,
 )
 from lidargrit.core.shares import each_done
+from lidargrit.data.datasets.shared.files import SENSOR_FILE
 from lidargrit.data.datasets.shared.odometry import num_poses, write_motions
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
@@ -77,9 +78,9 @@ class DriveConfig:
 def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1, ray: str = "") -> int:
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
-    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``. The poses
-    lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's own tools look there. Streets that are
-    seen once each are no drive: they have no times.
+    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``, with the
+    sensor in ``sensor.json``. The poses lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's
+    own tools look there. Streets that are seen once each are no drive: they have no times.
 
     Args:
         out: an empty folder, or a folder that the same simulation began; scans can be added to it.
@@ -177,7 +178,9 @@ def _last_scan(out: Path, config: DriveConfig) -> int:
 
 
 def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:
-    """Write what a sequence has once: poses, and times of a drive."""
+    """Write the sensor, and what a sequence has once: poses, and times of a drive."""
+    if not (sensor := out / SENSOR_FILE).exists():
+        write_json(sensor, config.sensor.to_json())
     scans = range(num_scans)
     if config.frames == 1:
         for first in scans[:: config.scans_per_sequence]:

@@ -33,7 +33,7 @@ def export_scans(
 
     Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
     names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
-    which scan.
+    which scan, and ``sensor.json`` on which rays points lie that come from images or that another sensor sees.
 
     Args:
         source: samples of ours or of another program, a prepared folder, or a source of scans.
@@ -62,6 +62,10 @@ def export_scans(
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     with folder.writing("exporting") as progress:
+        if isinstance(change, Rescan):
+            folder.tell_sensor(change.other)
+        elif isinstance(scans, ImageScans):
+            folder.tell_sensor(scans.images.sensor)
         for index in folder.missing:
             with folder.leaving_out(index):
                 layout.write(files[index], scan := read(index))

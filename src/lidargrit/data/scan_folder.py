@@ -26,7 +26,7 @@ from lidargrit.core.files import (
 from lidargrit.core.reporting import Progress
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
-from lidargrit.data.datasets.folder import SENSOR_FILE
+from lidargrit.data.datasets.shared.files import SENSOR_FILE
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.kitti_bin import KittiBin

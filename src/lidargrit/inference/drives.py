@@ -171,6 +171,7 @@ def write_drives(
     identity = {"source": str(run_folder), **facts, **sampling_identity(generator, run_folder, settings)}
     folder = ScanFolder(out, MANIFEST, identity, KittiTree(out).files(names), identities)
     with folder.writing("sampling") as progress:
+        folder.tell_sensor(generator.sensor)
         for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
             moved = [transform_between(pose, way.poses[0]).numpy() for pose in way.poses]
             write_motions(out, f"{drive:02d}", moved, [number * way.period_s for number in range(len(moved))])

@@ -13,7 +13,6 @@ from lidargrit.data.formats import BadPoints
 from lidargrit.data.formats.numpy_array import holds_points
 
 _SHARED_ENDINGS = (".png", ".csv", ".npy")  # of pictures, poses and labels, too
-SENSOR_FILE = "sensor.json"  # beside scans: what lidargrit complete writes, and what fit-sensor may
 _TOPIC = re.compile(r"(/[^\[\]]+)(\[[^\]]*\])?")
 
 
@@ -42,9 +41,8 @@ class Folder(FileDataset):
         super().__init__(root, split, bad_points)
         self.notes = _left_out(root, len({path for path, _ in self._scans}))
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
-        self.sensor = sensors[0] if sensors else type(self).sensor
-        if (root / SENSOR_FILE).is_file():
-            self.sensor = str(root / SENSOR_FILE)
+        if sensors and self.sensor == type(self).sensor:
+            self.sensor = sensors[0]
 
     def takes_files_in(self, folder: Path) -> bool:
         """Return whether a folder is the root or lies below it, at whatever depth."""

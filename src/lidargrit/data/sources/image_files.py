@@ -11,8 +11,8 @@ from lidargrit.core.determinism import evenly_spaced, natural_order
 from lidargrit.core.errors import ConfigError, DataError, LidarGritError, ScanError, printable
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
-from lidargrit.data.datasets.folder import SENSOR_FILE, Folder
-from lidargrit.data.datasets.shared.files import is_recognised, scans_below
+from lidargrit.data.datasets.folder import Folder
+from lidargrit.data.datasets.shared.files import SENSOR_FILE, is_recognised, scans_below
 from lidargrit.data.formats import read_bytes
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig

@@ -50,12 +50,16 @@ def contradicts_hdl64e(path: Path, form: type[ScanFormat]) -> bool:
     return above > _ABOVE_AT_MOST or float(np.quantile(elevation_deg, 0.01)) > _LOWEST_DEG
 
 
+SENSOR_FILE = "sensor.json"  # what simulate, complete and decompress write, and fit-sensor may
 _NAMED_AT_MOST = 5  # sequences in a message
 _SUBFOLDERS_AT_MOST = 100  # where a root is looked for that is one folder further down
 
 
 class FileDataset(ScanDataset):
-    """A data set of files, each with one scan, or several if its format allows it."""
+    """A data set of files, each with one scan, or several if its format allows it.
+
+    A file ``sensor.json`` in the root describes the sensor, whatever the layout: many programs write KITTI's.
+    """
 
     format: ClassVar[str]
     """Name of the files' format; empty where each file tells by its looks."""
@@ -69,6 +73,8 @@ class FileDataset(ScanDataset):
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
+        if (root / SENSOR_FILE).is_file():
+            self.sensor = str(root / SENSOR_FILE)
         found = {path: self.sequence_of(path.relative_to(root)) for path in self._find(root)}
         if not found:
             raise self._wrong_root()
