@@ -62,6 +62,20 @@ def test_a_sequence_given_itself_has_its_scans_alone(tmp_path):
     assert "4 files .bin, .png beside the scans left out" in found.notes[0]
 
 
+@pytest.mark.parametrize("root", ["00", "00/velodyne"])
+def test_a_sequence_given_itself_has_its_labels(tmp_path, root):
+    write_bin(tmp_path / "00/velodyne/000000.bin")
+    wanted = np.arange(len(xyz_of(TABLE)), dtype="<u4") % 3 + 10
+    (tmp_path / "00/labels").mkdir()
+    (tmp_path / "00/labels/000000.label").write_bytes(wanted.tobytes())
+    found = open_dataset(f"folder:{tmp_path}/{root}")
+    assert np.array_equal(found.scan(0).label, wanted)
+    assert tmp_path / "00/labels/000000.label" in found.sidecar_files(0)
+    (tmp_path / "00/labels/000000.label").write_bytes(bytes(4))
+    with pytest.raises(ScanError, match="4 bytes of labels"):
+        found.scan(0)
+
+
 def test_range_images_beside_scans_stay_scans(tmp_path):
     write_bin(tmp_path / "a.bin")
     Image.fromarray(np.full((64, 90), 500, np.uint16)).save(tmp_path / "b.png")

@@ -8,6 +8,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
+from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
@@ -249,6 +250,7 @@ def test_labels_of_dropped_points_are_dropped(bad, tmp_path):
     for name, data in (("velodyne/000000.bin", rows), ("labels/000000.label", np.arange(9, dtype="<u4"))):
         (folder / name).parent.mkdir(parents=True)
         (folder / name).write_bytes(data.tobytes())
-    scan = KittiOdometry(tmp_path, bad_points="drop").scan(0)
-    assert scan.label is not None
-    assert scan.label.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+    for dataset in (KittiOdometry(tmp_path, bad_points="drop"), Folder(folder, bad_points="drop")):
+        scan = dataset.scan(0)
+        assert scan.label is not None
+        assert scan.label.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]

@@ -9,8 +9,11 @@ from lidargrit.core.errors import printable
 from lidargrit.data import formats
 from lidargrit.data.datasets import files_of_others
 from lidargrit.data.datasets.shared.files import FileDataset, is_recognised, scans_below, unnamed_recording
+from lidargrit.data.datasets.shared.labels_beside import label_file, with_labels
 from lidargrit.data.formats import BadPoints
+from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.formats.numpy_array import holds_points
+from lidargrit.scans.types import Scan
 
 _SHARED_ENDINGS = (".png", ".csv", ".npy")  # of pictures, poses and labels, too
 _TOPIC = re.compile(r"(/[^\[\]]+)(\[[^\]]*\])?")
@@ -22,7 +25,7 @@ class Folder(FileDataset):
     Every file whose ending belongs to a format is a scan, hidden ones left out, and pictures, poses and labels beside
     scans (.png, .csv and .npy that hold no points). The sensor is that of a file ``sensor.json`` in the root, else that
     of the first file's format, if such files always have the same, and the HDL-64E of KITTI otherwise; choose yours
-    with ``data.sensor``.
+    with ``data.sensor``. A scan in ``velodyne`` has the labels in ``labels/NAME.label`` of SemanticKITTI beside it.
     """
 
     title = "a folder of scan files"
@@ -57,6 +60,16 @@ class Folder(FileDataset):
     def _find(cls, root: Path) -> list[Path]:
         return natural_order(_without_sidecar_files(scans_below(root))[0])
 
+    def scan(self, index: int) -> Scan:
+        """Read one scan, with SemanticKITTI's labels if it lies in a sequence that has them."""
+        scan, path = super().scan(index), self.path(index)
+        return with_labels(scan, path) if _may_have_labels(path) and formats.recognise(path) is KittiBin else scan
+
+    def sidecar_files(self, index: int) -> tuple[Path, ...]:
+        """Return the other files that a scan is read from, and its labels."""
+        path = self.path(index)
+        return (*super().sidecar_files(index), *([label_file(path)] if _may_have_labels(path) else []))
+
     def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""
         return relative.parent.as_posix()
@@ -64,6 +77,10 @@ class Folder(FileDataset):
     def recording_of(self, path: Path) -> str:
         """Name a recording by its folder."""
         return unnamed_recording(path)
+
+
+def _may_have_labels(path: Path) -> bool:
+    return path.suffix == ".bin" and path.absolute().parent.name == "velodyne"
 
 
 def _without_sidecar_files(found: Iterable[Path]) -> tuple[list[Path], list[Path]]:

@@ -1,23 +1,13 @@
 """KITTI odometry: ROOT/sequences/SS/velodyne/*.bin → scans of 22 drives, 11 of them with a pose."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-import torch
-
-from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
-from lidargrit.data.formats import read_bytes
-from lidargrit.scans.classes import notes_on_labels
-from lidargrit.scans.columns import usable_points
+from lidargrit.data.datasets.shared.labels_beside import label_file, with_labels
 from lidargrit.scans.types import Scan
 
-_LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
-_LABELS = "one uint32 for each point, as SemanticKITTI has them"
-_LABEL_BYTES_AT_MOST = 16_000_000  # of as many points as a file of scans may have
 _RAW_DRIVES = {  # which drive of KITTI raw a sequence was cut from; that of 11 to 21 was not published
     "00": "2011_10_03_drive_0027",
     "01": "2011_10_03_drive_0042",
@@ -40,8 +30,7 @@ class KittiOdometry(FileDataset):
     A scan has labels where ``labels/NNNNNN.label`` of SemanticKITTI lies beside ``velodyne``.
 
     Source:
-        The drives: readme.txt of the benchmark's development kit.
-        Labels: Behley et al., SemanticKITTI, ICCV 2019.
+        readme.txt of the benchmark's development kit.
     """
 
     title = "KITTI odometry"
@@ -74,28 +63,11 @@ class KittiOdometry(FileDataset):
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with its labels if there are any."""
-        scan, path = super().scan(index), self.path(index)
-        (labels,) = self.sidecar_files(index)
-        if not labels.is_file():
-            return scan
-        data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
-        rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
-        if len(data) != _LABEL_BYTES * len(rows):
-            raise ScanError(
-                f"{len(data)} bytes of labels in {labels}, and {len(rows)} points in {path}",
-                f"{_LABELS}: {_LABEL_BYTES * len(rows)} bytes",
-                "download both again, or move the labels away",
-            )
-        label = torch.from_numpy(data.view("<u4").astype(np.int64))
-        if len(scan) != len(label):  # points were dropped, and their labels go with them
-            points = torch.from_numpy(rows)
-            label = label[usable_points(points[:, :3], points[:, 3])]
-        return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))
+        return with_labels(super().scan(index), self.path(index))
 
     def sidecar_files(self, index: int) -> tuple[Path, ...]:
-        """Return the file of a scan's labels."""
-        path = self.path(index)
-        return (path.parents[1] / "labels" / f"{path.stem}.label",)
+        """Return the other files that a scan is read from, and its labels."""
+        return (*super().sidecar_files(index), label_file(self.path(index)))
 
     def sequence_of(self, relative: Path) -> str:
         """Name the sequence: "00"."""

@@ -1,0 +1,51 @@
+"""Labels of SemanticKITTI beside a scan: folder/velodyne/NAME.bin → folder/labels/NAME.label → the scan with labels."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lidargrit.core.errors import ScanError
+from lidargrit.data.formats import read_bytes
+from lidargrit.scans.classes import notes_on_labels
+from lidargrit.scans.columns import usable_points
+from lidargrit.scans.types import Scan
+
+_LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
+_LABELS = "one uint32 for each point, as SemanticKITTI has them"
+_LABEL_BYTES_AT_MOST = 16_000_000  # of as many points as a file of scans may have
+
+
+def label_file(path: Path) -> Path:
+    """Return where the labels of a scan lie, whether they are there or not."""
+    return path.absolute().parents[1] / "labels" / f"{path.stem}.label"
+
+
+def with_labels(scan: Scan, path: Path) -> Scan:
+    """Return a scan with its labels, or as it is where there are none.
+
+    Args:
+        path: file of KITTI's format that the scan was read from.
+
+    Raises:
+        ScanError: the file of labels is not of as many points.
+
+    Source:
+        Behley et al., SemanticKITTI, ICCV 2019.
+    """
+    if not (labels := label_file(path)).is_file():
+        return scan
+    data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
+    rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
+    if len(data) != _LABEL_BYTES * len(rows):
+        raise ScanError(
+            f"{len(data)} bytes of labels in {labels}, and {len(rows)} points in {path}",
+            f"{_LABELS}: {_LABEL_BYTES * len(rows)} bytes",
+            "download both again, or move the labels away",
+        )
+    label = torch.from_numpy(data.view("<u4").astype(np.int64))
+    if len(scan) != len(label):  # points were dropped, and their labels go with them
+        points = torch.from_numpy(rows)
+        label = label[usable_points(points[:, :3], points[:, 3])]
+    return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))
