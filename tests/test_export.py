@@ -319,8 +319,7 @@ def test_other_formats_and_sources_are_refused(samples, tmp_path):
 def test_the_command(samples, tmp_path, capsys):
     words = ["export", str(samples), str(tmp_path / "out"), "--format", "pcd"]
     assert main(words) == 0
-    captured = capsys.readouterr()
-    assert re.match(r"done: 2 scans in .*out", captured.out)
+    assert re.match(r"done: 2 scans in .*out", capsys.readouterr().out)
     assert main([*words[:-1], "ply"]) == 2
     assert "wanted an empty folder" in capsys.readouterr().err
 
