@@ -5,9 +5,9 @@
     python benchmarks/neighbours.py --words "demo --out {out}" -n 1 --limit 3000
 
 Each row is one way of waiting: as the command arranges it, as OpenMP does by itself (threads spin), and with one
-thread; or of keeping memory: as malloc does by itself. A busy process is a Python loop that never ends. Seconds are of
-the whole command, its start included, the least of the repeats; beside them how many processors others took during it,
-which should be the busy processes alone.
+thread; or of keeping memory: as malloc does by itself, which any of its variables means. A busy process is a Python
+loop that never ends. Seconds are of the whole command, its start included, the least of the repeats; beside them how
+many processors others took during it, which should be the busy processes alone.
 """
 
 import argparse
@@ -23,7 +23,7 @@ WAYS = {  # name → environment variables; the command leaves what is set alrea
     "as the command arranges it": {},
     "as OpenMP does by itself": {"GOMP_SPINCOUNT": "300000"},
     "one thread": {"OMP_NUM_THREADS": "1"},
-    "malloc returns freed memory": {"MALLOC_MMAP_MAX_": "65536"},
+    "as malloc does by itself": {"MALLOC_ARENA_MAX": "64"},
 }
 
 

@@ -13,6 +13,7 @@ from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.export import export_scans
+from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.sources import open_source
 from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.types import Scan
@@ -111,6 +112,17 @@ def test_the_verb_writes_scans_that_are_read_back_and_goes_on_where_it_was_stopp
     assert open_source(str(out)).sensor.name == "vlp16"
     assert main([*words[:-1], "pcd"]) == 2, "the folder is of another command"
     assert "choose another folder" in capsys.readouterr().err
+
+
+def test_a_command_whose_first_scan_fails_leaves_its_folder_to_a_corrected_one(tmp_path, capsys):
+    (tmp_path / "scans").mkdir()
+    (tmp_path / "scans" / "000000.bin").write_bytes(b"no scan at all, of an odd length")
+    words = ["rescan", str(tmp_path / "scans"), str(tmp_path / "out"), "--sensor", "os1_64", "--to"]
+    assert main([*words, "vlp16"]) == 2
+    assert "000000.bin" in capsys.readouterr().err
+    KittiBin.write(tmp_path / "scans" / "000000.bin", lidargrit.simulate(seed=1))
+    assert main([*words, "hdl32e"]) == 0
+    assert open_source(str(tmp_path / "out")).sensor.name == "hdl32e"
 
 
 def test_a_tree_of_a_raised_sensor_has_its_poses(tmp_path):

@@ -1,7 +1,6 @@
 """What a user types: words → one function of the library, its result, and an exit code."""
 
 import argparse
-import ctypes
 import errno
 import importlib
 import os
@@ -45,7 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str], is_program: bool = False) -> int:
     _let_threads_sleep()
-    _keep_freed_memory()
+    if is_program:
+        _keep_freed_memory()
     parser = build_parser()
     try:
         options = _parsed(parser, words)
@@ -102,16 +102,20 @@ def _let_threads_sleep() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Have glibc's malloc keep what torch frees for the next step, unless the user has set what malloc keeps.
+    """Have glibc's malloc keep up to 2 GiB of what torch frees for the next step, unless the user has set malloc up.
 
-    By default it returns each large block to the system, which clears its pages again for the next step: up to a third
-    of the time of training on a CPU. Other C libraries are left as they are.
+    By default it returns each block above 32 MiB to the system, which clears its pages again for the next step: up to a
+    third of the time of training on a CPU. Other C libraries are left as they are.
     """
-    if sys.platform == "linux" and not {"MALLOC_MMAP_MAX_", "MALLOC_TRIM_THRESHOLD_"} & os.environ.keys():
-        with suppress(AttributeError):
-            mallopt = ctypes.CDLL(None).mallopt
-            mallopt(_M_MMAP_MAX, 0)
-            mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
+    by_user = any(name.startswith("MALLOC_") for name in os.environ)
+    if sys.platform != "linux" or by_user or "glibc.malloc." in os.environ.get("GLIBC_TUNABLES", ""):
+        return
+    import ctypes
+
+    with suppress(AttributeError):  # musl has no such function
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_MAX, 0)
+        mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def build_parser() -> Parser:

@@ -20,9 +20,9 @@ from lidargrit.core.untrusted import check_path
 STANDARD_OUTPUT = Path("-")
 
 
-def look_at(folder: Path, *options: str) -> str:
+def look_at(folder: Path) -> str:
     """Return the command that shows the scans of a folder, for the last line of a verb that wrote them."""
-    return "look at them: " + shlex.join(["lidargrit", "view", str(folder), *options, "-o", f"{folder.name}.html"])
+    return "look at them: " + shlex.join(["lidargrit", "view", str(folder), "-o", f"{folder.name}.html"])
 
 
 def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json") -> None:

@@ -39,4 +39,4 @@ def run(options: argparse.Namespace) -> None:
     source = open_source(options.scans, settings.data.bad_points)
     change = Rescan(sensor_for(source, settings.sensor), other, options.raised_m)
     count = export_scans(options.scans, options.out, options.format, settings.data, change=change)
-    print(f"done: {counted_scans(count)} in {options.out}; {look_at(options.out, '--sensor', options.to)}")
+    print(f"done: {counted_scans(count)} in {options.out}; {look_at(options.out)}")

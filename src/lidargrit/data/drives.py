@@ -17,12 +17,13 @@ from lidargrit.core.files import (
     write_json,
 )
 from lidargrit.core.shares import each_done
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.datasets.shared.files import SENSOR_FILE
 from lidargrit.data.datasets.shared.odometry import num_poses, write_motions
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import begun_by
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, poses_of
 
 MANIFEST = "simulated.json"
@@ -78,9 +79,9 @@ class DriveConfig:
 def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 1, ray: str = "") -> int:
     """Write scans, labels and poses; scans that are there already are not simulated again.
 
-    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``, with the
-    sensor in ``sensor.json``. The poses lie in ``poses/SS.txt``, too: SemanticKITTI has them in the sequence, KITTI's
-    own tools look there. Streets that are seen once each are no drive: they have no times.
+    The tree is ``sequences/SS/{velodyne/NNNNNN.bin, labels/NNNNNN.label, poses.txt, times.txt, calib.txt}``, and
+    ``sensor.json`` for another sensor than KITTI's. The poses lie in ``poses/SS.txt``, too: SemanticKITTI has them in
+    the sequence, KITTI's own tools look there. Streets that are seen once each are no drive: they have no times.
 
     Args:
         out: an empty folder, or a folder that the same simulation began; scans can be added to it.
@@ -107,6 +108,7 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
         shares = [missing[first : first + size] for first in range(0, len(missing), size)]
         with reporting.progress("simulating", there, there - len(missing)) as progress:
             for count in each_done(partial(_write_scans, out, config), shares, workers, ray):
+                _write_sensor(out, config)
                 progress.advance(count)
         if config.frames == 1:  # last, so that a sensor that sees nothing leaves the folder free
             _write_sequence_files(out, config, there)
@@ -118,6 +120,13 @@ def _claim(out: Path, config: DriveConfig) -> None:
     other = "which holds scans simulated in another way"
     if begun_by(out / MANIFEST, lambda there: "" if there == facts else other) is None:
         write_json(out / MANIFEST, facts)
+
+
+def _write_sensor(out: Path, config: DriveConfig) -> None:
+    """Write the sensor, unless it is the one that readers of such trees take."""
+    facts, file = config.sensor.to_json(), out / SENSOR_FILE
+    if not file.exists() and facts != load_sensor(KittiOdometry.sensor).to_json():
+        write_json(file, facts)
 
 
 def _write_scans(out: Path, config: DriveConfig, scans: Sequence[int]) -> int:
@@ -178,9 +187,8 @@ def _last_scan(out: Path, config: DriveConfig) -> int:
 
 
 def _write_sequence_files(out: Path, config: DriveConfig, num_scans: int) -> None:
-    """Write the sensor, and what a sequence has once: poses, and times of a drive."""
-    if not (sensor := out / SENSOR_FILE).exists():
-        write_json(sensor, config.sensor.to_json())
+    """Write what a sequence has once: poses, and times of a drive."""
+    _write_sensor(out, config)
     scans = range(num_scans)
     if config.frames == 1:
         for first in scans[:: config.scans_per_sequence]:

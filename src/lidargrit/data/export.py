@@ -61,14 +61,15 @@ def export_scans(
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
+    told_by_format = isinstance(layout, _Flat) and layout.tells_sensor
+    sensor = None if told_by_format else _rays_of(scans, change)
     with folder.writing("exporting") as progress:
-        if isinstance(change, Rescan):
-            folder.tell_sensor(change.other)
-        elif isinstance(scans, ImageScans):
-            folder.tell_sensor(scans.images.sensor)
         for index in folder.missing:
             with folder.leaving_out(index):
-                layout.write(files[index], scan := read(index))
+                scan = read(index)
+                if sensor is not None:  # only now: a folder without any scan is left free
+                    folder.tell_sensor(sensor)
+                layout.write(files[index], scan)
                 if scan.label is not None and not layout.keeps_labels:
                     folder.tell_labels_lost(files[index])
                 scans.tell_notes(scan)
@@ -138,6 +139,13 @@ class _Changed:
         return changed.scan
 
 
+def _rays_of(scans: NamedScans, change: Rescan | UndoMotion | None) -> SensorModel | None:
+    """Return the sensor on whose rays points lie that come from images or that another sensor sees."""
+    if isinstance(change, Rescan):
+        return change.other
+    return scans.images.sensor if isinstance(scans, ImageScans) else None
+
+
 def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> tuple[NamedScans, dict[str, Any]]:
     """Return the scans of a source, and the sensor as an entry of the manifest where the source does not name it."""
     opened = open_source(source, config.bad_points)
@@ -155,7 +163,7 @@ class _Flat:
 
     def __init__(self, out: Path, form: type[ScanFormat], suffix: str) -> None:
         self._out, self._form, self._suffix = out, form, suffix
-        self.keeps_labels = "label" in form.keeps
+        self.keeps_labels, self.tells_sensor = "label" in form.keeps, bool(form.sensor)
 
     def files(self, names: list[str]) -> list[str]:
         return [name + self._suffix for name in names]

@@ -44,6 +44,7 @@ class Folder(FileDataset):
         super().__init__(root, split, bad_points)
         self.notes = _left_out(root, len({path for path, _ in self._scans}))
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
+        self.sensor = self._sensor_beside()
         if sensors and self.sensor == type(self).sensor:
             self.sensor = sensors[0]
 

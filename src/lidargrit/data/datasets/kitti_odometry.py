@@ -6,6 +6,7 @@ from typing import ClassVar
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.datasets.shared.labels_beside import label_file, with_labels
+from lidargrit.data.formats import BadPoints
 from lidargrit.scans.types import Scan
 
 _RAW_DRIVES = {  # which drive of KITTI raw a sequence was cut from; that of 11 to 21 was not published
@@ -27,7 +28,8 @@ class KittiOdometry(FileDataset):
     """The 22 sequences of the KITTI odometry benchmark, motion-corrected; ROOT/dataset/sequences is found too.
 
     Sequences 00 to 10 are drives of KITTI raw: a scan of each may be in the other, differing by the car's motion.
-    A scan has labels where ``labels/NNNNNN.label`` of SemanticKITTI lies beside ``velodyne``.
+    A scan has labels where ``labels/NNNNNN.label`` of SemanticKITTI lies beside ``velodyne``. Many programs write this
+    layout, ``simulate`` too: a file ``sensor.json`` in the root describes another sensor.
 
     Source:
         readme.txt of the benchmark's development kit.
@@ -52,6 +54,10 @@ class KittiOdometry(FileDataset):
     }
     patterns = ("sequences/*/velodyne/*.bin", "dataset/sequences/*/velodyne/*.bin")
     examples = ("sequences/00/velodyne/{index:06d}.bin", "sequences/08/velodyne/{index:06d}.bin")
+
+    def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
+        super().__init__(root, split, bad_points)
+        self.sensor = self._sensor_beside()
 
     @classmethod
     def origin_of(cls, root: Path) -> str:

@@ -194,7 +194,7 @@ def _spec(
         beside += filter(None, map(_state, dataset.sidecar_files(index)))
     others = json.dumps(beside) if beside else ""
     # The sensor by which scans are simulated is in no name of theirs, and its file may change.
-    if dataset.sensor.lower().endswith(".json") or (isinstance(dataset, Streets) and dataset.sensor != Streets.sensor):
+    if isinstance(dataset, Streets) and dataset.sensor != Streets.sensor:
         others += json.dumps(load_sensor(dataset.sensor).to_json())
     spec = PreparedSpec(
         format=FORMAT,

@@ -10,6 +10,7 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import OutputError, printable
 from lidargrit.data.datasets import ScanDataset, Window
+from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import read_scan
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -205,8 +206,8 @@ def first_scan(text: str, config: DataConfig) -> tuple[Scan, str]:
         return read_scan(text, bad_points=config.bad_points), ""
     source = open_source(text, config.bad_points)
     dataset = source.scans()
-    # The files of a folder that is no known data set tell no sensor, as a file alone tells none.
-    sensor = "" if source.data_set == "folder" else dataset.sensor
+    # The files of a folder that is no known data set tell no sensor, as a file alone tells none; sensor.json does.
+    sensor = "" if source.data_set == "folder" and dataset.sensor == Folder.sensor else dataset.sensor
     if not skips:
         scan, skipped = dataset.scan(0), ()
     else:

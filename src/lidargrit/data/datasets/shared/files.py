@@ -50,16 +50,13 @@ def contradicts_hdl64e(path: Path, form: type[ScanFormat]) -> bool:
     return above > _ABOVE_AT_MOST or float(np.quantile(elevation_deg, 0.01)) > _LOWEST_DEG
 
 
-SENSOR_FILE = "sensor.json"  # what simulate, complete and decompress write, and fit-sensor may
+SENSOR_FILE = "sensor.json"  # in the root of scans that the program wrote, and where fit-sensor may write
 _NAMED_AT_MOST = 5  # sequences in a message
 _SUBFOLDERS_AT_MOST = 100  # where a root is looked for that is one folder further down
 
 
 class FileDataset(ScanDataset):
-    """A data set of files, each with one scan, or several if its format allows it.
-
-    A file ``sensor.json`` in the root describes the sensor, whatever the layout: many programs write KITTI's.
-    """
+    """A data set of files, each with one scan, or several if its format allows it."""
 
     format: ClassVar[str]
     """Name of the files' format; empty where each file tells by its looks."""
@@ -73,8 +70,6 @@ class FileDataset(ScanDataset):
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
-        if (root / SENSOR_FILE).is_file():
-            self.sensor = str(root / SENSOR_FILE)
         found = {path: self.sequence_of(path.relative_to(root)) for path in self._find(root)}
         if not found:
             raise self._wrong_root()
@@ -99,6 +94,11 @@ class FileDataset(ScanDataset):
 
     def __len__(self) -> int:
         return len(self._scans)
+
+    def _sensor_beside(self) -> str:
+        """Return the file ``sensor.json`` in the root, else the sensor of the data set."""
+        file = self.root / SENSOR_FILE
+        return str(file) if file.is_file() else type(self).sensor
 
     def scan(self, index: int) -> Scan:
         """Read one scan."""
