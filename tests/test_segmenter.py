@@ -14,7 +14,9 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.data import formats
+from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.scan_folder import KittiTree
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation.metrics.shared.labelled import segmenter_of
 from lidargrit.generation.semantic_classes import labels_of
 from lidargrit.inference.segment import can_label, class_probabilities, label_images, open_segmenter
@@ -231,6 +233,14 @@ def test_the_verb_writes_a_label_for_every_point_and_goes_on(run, tmp_path, caps
     page = tmp_path / "page.html"
     assert main(["view", str(tmp_path / "out"), "-o", str(page), "--set", "data.columns=64"]) == 0
     assert any(f'"{CLASSES[int(n)].name}"' in page.read_text() for n in np.unique(np.fromfile(labels[0], "<u4")) if n)
+
+
+def test_a_labelled_tree_tells_the_sensor_of_its_segmenter(tmp_path):
+    pandar = load_sensor("pandar64")
+    made(pandar.with_columns(64)).save(tmp_path / "run")
+    write_drives(tmp_path / "in", 1, DriveConfig(pandar.with_columns(64)))
+    assert main(["segment", str(tmp_path / "in"), str(tmp_path / "out"), "--model", str(tmp_path / "run")]) == 0
+    assert open_source(str(tmp_path / "out")).sensor.same_rays(pandar.with_columns(64))
 
 
 def test_the_sensor_that_a_run_learned_from_may_be_named_with_all_its_columns(run, tmp_path, capsys):

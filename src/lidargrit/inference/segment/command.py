@@ -11,6 +11,7 @@ from torch import Tensor
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.table import Table
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, weights_sha256
 from lidargrit.data.scan_folder import KittiTree, ScanFolder, write_with_labels
@@ -123,6 +124,8 @@ def segment_scans(
                     source_scans.tell_notes(scan)
                 label = labels.of(index, scan)
                 if index in folder.missing:
+                    if labels.sensor.name != KittiOdometry.sensor:  # else readers of such trees take it anyway
+                        folder.tell_sensor(labels.sensor)
                     write_with_labels(out / files[index], replace(scan, label=label))
                 if scores is not None:
                     scores.add(label, _own_labels(scan, numbering))
@@ -155,6 +158,7 @@ class _Labels:
     def __init__(self, scans: NamedScans, segmenter: Segmenter, projection: ProjectionOption) -> None:
         self._scans, self._segmenter = scans, segmenter
         self._points = PointLabels(segmenter, projection)
+        self.sensor = scans.images.sensor if isinstance(scans, ImageScans) else segmenter.sensor.fine()
         self._told = set[str]()
 
     def of(self, index: int, scan: Scan) -> Int[Tensor, " n"]:
