@@ -32,7 +32,7 @@ def test_labels_that_come_later_make_prepared_scans_stale(tmp_path):
     cached = prepare(source, CONFIG)
     prepare(source, CONFIG, out)
     dataset = KittiOdometry(tree)
-    (labels,) = dataset.sidecar_files(0)
+    *_, labels = dataset.sidecar_files(0)
     labels.parent.mkdir()
     np.full(len(dataset.scan(0)), 40, "<u4").tofile(labels)
     with pytest.raises(OutputError, match="stale"):
