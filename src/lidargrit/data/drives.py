@@ -18,11 +18,10 @@ from lidargrit.core.files import (
 )
 from lidargrit.core.shares import each_done
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
-from lidargrit.data.datasets.shared.files import SENSOR_FILE
 from lidargrit.data.datasets.shared.odometry import num_poses, write_motions
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
-from lidargrit.data.scan_folder import begun_by
+from lidargrit.data.scan_folder import begun_by, write_sensor
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, poses_of
 
@@ -124,9 +123,8 @@ def _claim(out: Path, config: DriveConfig) -> None:
 
 def _write_sensor(out: Path, config: DriveConfig) -> None:
     """Write the sensor, unless it is the one that readers of such trees take."""
-    facts, file = config.sensor.to_json(), out / SENSOR_FILE
-    if not file.exists() and facts != load_sensor(KittiOdometry.sensor).to_json():
-        write_json(file, facts)
+    if config.sensor.to_json() != load_sensor(KittiOdometry.sensor).to_json():
+        write_sensor(out, config.sensor)
 
 
 def _write_scans(out: Path, config: DriveConfig, scans: Sequence[int]) -> int:

@@ -27,6 +27,7 @@ from lidargrit.core.reporting import Progress
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
 from lidargrit.data.datasets.shared.files import SENSOR_FILE
+from lidargrit.data.datasets.shared.labels_beside import label_file
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.kitti_bin import KittiBin
@@ -129,9 +130,8 @@ class ScanFolder:
             self._told_labels = True
 
     def tell_sensor(self, sensor: SensorModel) -> None:
-        """Write beside the scans, unless it is there, on which rays their points lie."""
-        if not (path := self.out / SENSOR_FILE).exists():
-            write_json(path, sensor.to_json())
+        """Write beside the scans on which rays their points lie."""
+        write_sensor(self.out, sensor)
 
     def _claim(self) -> None:
         scans = self._facts["scans"]
@@ -156,6 +156,12 @@ class ScanFolder:
             return f"whose {self._manifest.name} has another {other[0]!r}"
         changed = next((file for file, name in scans.items() if known.get(file, name) != name), None)
         return f"where {changed} is another scan of {facts['source']}" if changed else ""
+
+
+def write_sensor(out: Path, sensor: SensorModel) -> None:
+    """Write the sensor of a folder's scans, unless it is there."""
+    if not (path := out / SENSOR_FILE).exists():
+        write_json(path, sensor.to_json())
 
 
 def begun_by(manifest: Path, difference: Callable[[dict[str, Any]], str]) -> dict[str, Any] | None:
@@ -250,7 +256,7 @@ class KittiTree:
 def write_with_labels(path: Path, scan: Scan) -> None:
     """Write a scan into a file of KITTI odometry's tree, and its labels, if it has any, into that beside it."""
     if scan.label is not None:  # before the points, whose file says that the scan is complete
-        with atomic_path(path.parents[1] / "labels" / f"{path.stem}.label") as temporary:
+        with atomic_path(label_file(path)) as temporary:
             temporary.write_bytes(scan.label.numpy().astype("<u4").tobytes())
     KittiBin.write(path, scan)
 
