@@ -44,9 +44,10 @@ def test_operations_of_decoding_are_those_that_torch_counts():
 
 def test_features_tell_codes_apart_and_those_of_near_levels_or_of_most_parts_in_common_are_alike():
     tokenizer = NearestRangeTokenizer(replace(CONFIG, part_columns=2), SENSOR)
-    features = tokenizer.code_features()
+    features, group_size = tokenizer.code_features()
     patterns = ["farther nearest", "nearest farther", "nearest nearest", "nearest dropped", "dropped nearest"]
     assert features.shape[0] == tokenizer.num_codes == 1 + 128 * len(patterns)
+    assert group_size == len(patterns), "codes of a group share their level"
     assert len(features.unique(dim=0)) == tokenizer.num_codes
     directions = features / features.norm(dim=1, keepdim=True)
 

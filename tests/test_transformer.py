@@ -9,21 +9,22 @@ import torch
 from scipy import stats
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.nn.codes import CodeFeatures, GroupedCodeHead
 from lidargrit.nn.decoding import CachedDecoder
 from lidargrit.nn.transformer import CausalTransformer, TransformerConfig, resample_positions
 from lidargrit.systems.lidargrit.system import START_TOKEN, TokenSampling, after_start, sample_token
 from reference_weights import seeded_weights
 
 GREEDY = TokenSampling(temperature=0.0)
-CODE_FEATURES = torch.randn((20, 5), generator=torch.Generator().manual_seed(3))
+CODE_FEATURES = CodeFeatures(torch.randn((21, 5), generator=torch.Generator().manual_seed(3)), group_size=4)
 
 
 @pytest.fixture
 def transformer():
     torch.manual_seed(0)
     small = CausalTransformer(TransformerConfig(layers=2, heads=4, width=32), num_tokens=20, grid_size=(1, 24)).eval()
-    torch.nn.init.normal_(small.head.weight, std=0.5)  # far from uniform, so that a mistake shows
-    torch.nn.init.normal_(small.pos_emb, std=0.5)
+    for weight in (*small.head.parameters(), small.pos_emb):
+        torch.nn.init.normal_(weight, std=0.5)  # far from uniform, so that a mistake shows
     return small
 
 
@@ -115,7 +116,7 @@ def embedding_by_loop(transformer):
     """Return each code's own vector plus those of its features, one code and one feature at a time."""
     vectors = transformer.tok_emb.weight.clone()
     if transformer.shared is not None:
-        for code, features in enumerate(CODE_FEATURES):
+        for code, features in enumerate(CODE_FEATURES.of_codes):
             for number, value in enumerate(features):
                 vectors[code] += 3 * value / features.norm() * transformer.shared.embedding[number]
     return vectors
@@ -145,12 +146,10 @@ def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_the
         layers=2, heads=2, width=16, embedding_dropout=0.0, neighbours=True, code_features=shared
     )
     transformer = CausalTransformer(
-        config, num_tokens=20, grid_size=(4, 6), code_features=CODE_FEATURES if shared else None
+        config, num_tokens=21, grid_size=(4, 6), code_features=CODE_FEATURES if shared else None
     ).eval()
-    torch.nn.init.normal_(transformer.tok_emb.weight, std=0.5)
-    torch.nn.init.normal_(transformer.head.weight, std=0.5)
-    if shared:
-        torch.nn.init.normal_(transformer.shared.head, std=0.5)
+    for weight in (transformer.tok_emb.weight, *transformer.head.parameters()):
+        torch.nn.init.normal_(weight, std=0.5)
     uniform = torch.rand((3, 24), generator=torch.Generator().manual_seed(1))
     sampled = generate(transformer, uniform, TokenSampling(), static=static)
     with torch.no_grad():
@@ -159,26 +158,54 @@ def test_the_tokens_around_are_those_of_a_loop_and_steps_with_the_cache_know_the
         around = transformer.embedded(read) - plain
         assert torch.allclose(around, tokens_around_by_loop(transformer, read, 6), atol=1e-5)
         assert torch.allclose(transformer(read[:, :9]), transformer(read)[:, :9], atol=1e-5)  # of a shorter sequence
+        fewer_than_codes = read[:1, :9]
+        assert torch.allclose(transformer(fewer_than_codes), transformer(read)[:1, :9], atol=1e-5)
         logits = transformer(read)
     chosen = [sample_token(logits[:, i], uniform[:, i], TokenSampling()) for i in range(24)]
     assert torch.equal(torch.stack(chosen, 1), sampled)
 
 
-def test_codes_that_share_weights_learn_from_one_another():
-    """A step on one code moves the logits of those with alike features, too; without features of its own alone."""
-    for features, alike in ((torch.tensor([[1.0, 0.0], [1.0, 0.1], [0.0, 1.0]]), True), (None, False)):
-        torch.manual_seed(0)
-        config = TransformerConfig(1, 2, 8, embedding_dropout=0.0, code_features=alike)
-        network = CausalTransformer(config, 3, (1, 2), features)
-        read = torch.zeros((1, 2), dtype=torch.long)
-        before = network(read)[0, -1].detach()
-        network(read)[0, -1].log_softmax(-1)[0].backward()
-        with torch.no_grad():
-            for weight in (network.head.weight, *(() if features is None else (network.shared.head,))):
-                weight.add_(weight.grad, alpha=0.1)
-        moved = (network(read)[0, -1] - before).detach()
-        assert moved[0] > 0
-        assert (moved[1] > 0.5 * moved[0]) == alike
+def log_probabilities_by_loop(head, x):
+    """Return the log-probability of every code at one position, one group and one code at a time."""
+    of_groups = torch.tensor([float(head.group.weight[group] @ x) for group in range(1 + head.num_groups)])
+    found = [of_groups.log_softmax(0)[0]]
+    for group in range(head.num_groups):
+        hidden = head.hidden.weight @ x + head.hidden.bias + head.of_group.weight[group]
+        hidden = hidden * 0.5 * (1 + torch.erf(hidden / 2**0.5))
+        within = head.in_group.weight @ hidden + head.in_group.bias
+        found += [of_groups.log_softmax(0)[1 + group] + each for each in within.log_softmax(0)]
+    return torch.stack(found)
+
+
+def test_a_grouped_head_is_a_loop_over_its_groups_and_all_its_probabilities_are_1_together():
+    torch.manual_seed(0)
+    head = GroupedCodeHead(8, num_codes=21, group_size=4)
+    for weight in head.parameters():
+        torch.nn.init.normal_(weight, std=0.5)
+    x, codes = torch.randn(3, 21, 8), torch.stack([torch.randperm(21) for _ in range(3)])
+    with torch.no_grad():
+        logits, nats = head(x), head.nats(x, codes)
+        wanted = torch.stack([torch.stack([log_probabilities_by_loop(head, one) for one in line]) for line in x])
+    assert torch.allclose(logits, wanted, atol=1e-5)
+    assert torch.allclose(logits.exp().sum(-1), torch.ones(3, 21), atol=1e-5)
+    assert torch.allclose(nats, -wanted.gather(-1, codes[..., None])[..., 0], atol=1e-5)
+    assert wanted.std() > 1
+
+
+def test_codes_of_a_group_learn_from_those_at_the_same_place_in_others():
+    """A step on one code moves the share of its place in all groups, and not that of other places."""
+    torch.manual_seed(0)
+    head, x = GroupedCodeHead(8, num_codes=21, group_size=4), torch.randn(1, 1, 8)
+    of_places = lambda: head(x)[0, 0, 1:].unflatten(0, (5, 4)).log_softmax(-1).detach()  # noqa: E731
+    before = of_places()
+    head.nats(x, torch.tensor([[6]])).sum().backward()  # the second code of the second group
+    with torch.no_grad():
+        for weight in head.parameters():
+            assert weight.grad is not None
+            weight.sub_(0.1 * weight.grad)
+    moved = of_places() - before
+    assert float(moved[:, 1].min()) > 0
+    assert float(moved[:, (0, 2, 3)].max()) < 0
 
 
 def test_features_of_codes_are_refused_of_a_tokenizer_that_has_none():
@@ -316,7 +343,8 @@ def test_a_changed_weight_is_noticed_and_token_bits_are_those_of_the_transformer
         for position in (0, 7, 255):
             share = odds[0, position, tokens.tokens.flatten()[position]]
             assert float(bits.tokens.flatten()[position]) == pytest.approx(-np.log2(float(share)), abs=1e-4)
-        generator.transformer.head.weight.mul_(-30)
+        for weight in generator.transformer.head.parameters():
+            weight.mul_(-30)
     assert not torch.equal(generator.sample([0]).range_m, first.range_m)
 
 

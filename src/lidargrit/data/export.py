@@ -33,7 +33,7 @@ def export_scans(
 
     Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
     names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
-    which scan, and ``sensor.json`` on which rays points lie that come from images or that another sensor sees.
+    which scan, and ``sensor.json`` on which rays points lie, unless a folder's scans are taken to be of that sensor.
 
     Args:
         source: samples of ours or of another program, a prepared folder, or a source of scans.
@@ -62,7 +62,8 @@ def export_scans(
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     told_by_format = isinstance(layout, _Flat) and layout.tells_sensor
-    sensor = None if told_by_format else _rays_of(scans, change)
+    seen_by = change.other if isinstance(change, Rescan) else scans.sensor()
+    sensor = None if told_by_format else seen_by
     with folder.writing("exporting") as progress:
         for index in folder.missing:
             with folder.leaving_out(index):
@@ -137,13 +138,6 @@ class _Changed:
             reporting.message(f"{printable(changed.scan.source)}: {changed.told}")
             self._told = True
         return changed.scan
-
-
-def _rays_of(scans: NamedScans, change: Rescan | UndoMotion | None) -> SensorModel | None:
-    """Return the sensor on whose rays points lie that come from images or that another sensor sees."""
-    if isinstance(change, Rescan):
-        return change.other
-    return scans.images.sensor if isinstance(scans, ImageScans) else None
 
 
 def _open(source: str, config: DataConfig, sensor: SensorModel | None) -> tuple[NamedScans, dict[str, Any]]:

@@ -5,6 +5,7 @@ token at a time, and a step takes few operations: query, key and value come from
 once, and residuals are added in place. In 32 bits the result is the transformer's own but for rounding.
 """
 
+import copy
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -76,7 +77,7 @@ class CachedDecoder:
         static: bool | None = None,
         guidance: float = 1.0,
     ) -> None:
-        self._device = transformer.head.weight.device
+        self._device = transformer.pos_emb.device
         if precision == "int8" and self._device.type != "cpu":
             raise ConfigError(f"8-bit weights on {self._device.type}", "a CPU", "use bf16 there")
         self._sample_token, self._start, self._length = sample_token, start, transformer.context_length
@@ -93,7 +94,7 @@ class CachedDecoder:
         self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
         self._guidance, self._weaker = guidance, self._blocks[-2:] if guidance != 1 else []
         self._last_norm = _norm(transformer.ln_f, dtype)
-        self._head = transformer.head_weight().detach().to(dtype)
+        self._head = copy.deepcopy(transformer.head).requires_grad_(False).to(dtype)
         # Layer, key or value, sequence and head, position, number: a step writes one position of all layers, the weaker
         # transformer's own last one behind those of all blocks.
         layers = len(self._blocks) + len(self._weaker[1:])
@@ -163,7 +164,7 @@ class CachedDecoder:
         read = F.pad(known[:, :-1], (1, 0), value=self._start)
         x = F.embedding(read, self._embedding) + self._positions[:count]
         if self._around is not None:
-            x = x + self._around(read, self._tables)
+            x = x + self._around.added(self._around.around(read), self._tables)
 
         def attended(layer: int, block: _Block, x: Tensor) -> Tensor:
             parts = block.query_key_value(block.norm1(x), None).unflatten(0, (-1, count))
@@ -239,7 +240,7 @@ class CachedDecoder:
         return x, weaker
 
     def _head_logits(self, x: Tensor) -> Tensor:
-        return F.linear(self._last_norm(x), self._head).float()
+        return self._head(self._last_norm(x)).float()
 
     def _static_step(self, num_positions: int) -> None:
         """Generate the token at the position that a tensor holds, and advance it; no shape depends on the position."""
@@ -279,7 +280,7 @@ class CachedDecoder:
 def flops_of_step(transformer: CausalTransformer, position: int, guidance: float = 1.0) -> int:
     """Return the operations that the token at a position of one sequence takes, with a cache."""
     layers, width = transformer.config.layers, transformer.config.width
-    perceptron, head = 16 * width**2, 2 * width * transformer.num_tokens
+    perceptron, head = 16 * width**2, transformer.head.flops
     # Four projections, queries by keys, and weights by values.
     block = 8 * width**2 + 4 * width * (position + 1) + perceptron
     flops = layers * block + head

@@ -17,7 +17,8 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, ShareBelow1
 from lidargrit.nn.blocks import Block, Network
-from lidargrit.nn.precision import without_autocast
+from lidargrit.nn.codes import CodeFeatures, CodeHead, GroupedCodeHead, SharedEmbedding
+from lidargrit.nn.precision import as_in_products, without_autocast
 from lidargrit.nn.windows import Windows
 
 _QUERIES_AT_ONCE = 128  # their scores with all keys stay in a processor's cache
@@ -56,7 +57,6 @@ def attend(
 
 
 _AROUND = ((0, -2), (0, -3), *((-1, right) for right in range(-2, 3)), (-2, -1), (-2, 0), (-2, 1), (-3, 0))
-_FEATURES_LENGTH = 3.0  # of each code's: what codes share then moves more quickly than what each has of its own
 _AROUND_IF_SHARED = 0.3  # of the usual first weights of the tokens around, since shared embeddings begin longer
 _WINDOWS_AT_MOST = 64  # of a scan: beyond, each column is learned many times over
 _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
@@ -75,7 +75,8 @@ class TransformerConfig(Settings):
         neighbours: whether a position also reads the tokens around it in the grid that come before it, where the paper
             gives it the previous token alone and leaves it to attention to learn where the row above lies.
         code_features: whether codes share weights by what they stand for, such as their range, so that a rare code is
-            learned from those like it. The tokenizer has to know what its codes stand for, as ``nearest_range`` does.
+            learned from those like it; first the range of a token is predicted, then the rest of its meaning. The
+            tokenizer has to know what its codes stand for, as ``nearest_range`` does.
         window_columns: number of columns of tokens that are read at once, column by column, as the sensor turns; half
             of them go on from earlier ones. 0 reads whole scans, row by row, as in the paper.
         windows_per_scan: number of windows that a training reads of each scan. More of them spare loading scans, which
@@ -112,7 +113,7 @@ class Transformer(Network):
         num_tokens: number of different tokens that it predicts.
         context_length: number of tokens in the longest sequence.
         causal: whether a token attends only to itself and to those before it.
-        code_features: features of every code, by which codes share weights; None where each has its own alone.
+        code_features: what codes stand for, by which they share weights; None where each has its own alone.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.3; layers as in hamedhaghighi/LidarGRIT@a3f86e7.
@@ -125,7 +126,7 @@ class Transformer(Network):
         num_tokens: int,
         context_length: int,
         causal: bool,
-        code_features: Float[Tensor, "K F"] | None = None,
+        code_features: CodeFeatures | None = None,
     ) -> None:
         super().__init__()
         self.config, self.num_tokens, self.context_length = config, num_tokens, context_length
@@ -134,47 +135,27 @@ class Transformer(Network):
         self.drop = nn.Dropout(config.embedding_dropout)
         self.blocks = nn.ModuleList(TransformerBlock(config, causal) for _ in range(config.layers))
         self.ln_f = nn.LayerNorm(config.width)
-        self.head = nn.Linear(config.width, num_tokens, bias=False)
-        self.shared = None if code_features is None else SharedByCodes(code_features, config.width)
+        self.head: CodeHead | GroupedCodeHead = CodeHead(config.width, num_tokens)
+        self.shared: SharedEmbedding | None = None
+        if code_features is not None:
+            self.head = GroupedCodeHead(config.width, num_tokens, code_features.group_size)
+            self.shared = SharedEmbedding(code_features.of_codes, config.width)
         self.apply(_initialise)
 
     def forward(self, tokens: Int[Tensor, "B T"]) -> Float[Tensor, "B T K"]:
         """Return the logits at each position: of the next token if causal, else of the position's own."""
-        return self._logits(F.embedding(tokens, self.embedding()) + self.pos_emb[:, : tokens.shape[1]])
+        return self.head(self._read(F.embedding(tokens, self.embedding()) + self.pos_emb[:, : tokens.shape[1]]))
 
-    def _logits(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T K"]:
+    def _read(self, x: Float[Tensor, "B T C"]) -> Float[Tensor, "B T C"]:
         x = self.drop(x)
         for block in self.blocks:
             x = block(x)
-        return F.linear(self.ln_f(x), self.head_weight())
+        return self.ln_f(x)
 
     def embedding(self) -> Float[Tensor, "N C"]:
         """Return the vector that stands for each token that is read."""
         own = self.tok_emb.weight
-        return own if self.shared is None else own + self.shared.features @ self.shared.embedding
-
-    def head_weight(self) -> Float[Tensor, "K C"]:
-        """Return the vector whose product with the last block's output is the logit of each token."""
-        own = self.head.weight
-        return own if self.shared is None else own + self.shared.features @ self.shared.head
-
-
-class SharedByCodes(nn.Module):
-    """Weights that codes share by their features, beside the weights that each has of its own.
-
-    Args:
-        features: features of every code; codes that stand for alike things have alike features.
-        width: length of the vector that stands for a token.
-    """
-
-    features: Tensor
-
-    def __init__(self, features: Float[Tensor, "K F"], width: int) -> None:
-        super().__init__()
-        scaled = features * (_FEATURES_LENGTH / features.norm(dim=1, keepdim=True))
-        self.register_buffer("features", scaled, persistent=False)
-        self.embedding = nn.Parameter(torch.randn(features.shape[1], width) * 0.1)
-        self.head = nn.Parameter(torch.zeros(features.shape[1], width))
+        return own if self.shared is None else own + self.shared()
 
 
 class TokensAround(nn.Module):
@@ -212,10 +193,22 @@ class TokensAround(nn.Module):
         mapped = torch.einsum("kc,ncd->nkd", embedding, self.maps).flatten(0, 1).to(embedding.dtype)
         return torch.cat((mapped, mapped.new_zeros(1, mapped.shape[1])))
 
-    def forward(self, tokens: Int[Tensor, "B T"], tables: Float[Tensor, "R C"]) -> Float[Tensor, "B T C"]:
-        """Return what is added at each position of sequences that begin with the start token."""
+    def forward(self, tokens: Int[Tensor, "B T"], embedding: Float[Tensor, "K C"]) -> Float[Tensor, "B T C"]:
+        """Return what is added at each position of sequences that begin with the start token.
+
+        Codes are mapped once where there are fewer of them than tokens; else the tokens are.
+        """
+        around = self.around(tokens)
+        if tokens.numel() > len(embedding):
+            return self.added(around, self.tables(embedding))
+        vectors = F.pad(as_in_products(embedding), (0, 0, 0, 1))
+        read = F.embedding(torch.where(around < 0, len(embedding), around), vectors)
+        return (read.flatten(-2) @ self.maps.flatten(0, 1)).to(embedding.dtype)
+
+    def around(self, tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T N"]:
+        """Return the tokens around each position of sequences that begin with the start token; -1 is none."""
         known = F.pad(tokens, (0, len(self.places) + 1 - tokens.shape[1]), value=-1)
-        return self.added(known[:, self.places[: tokens.shape[1]]], tables)
+        return known[:, self.places[: tokens.shape[1]]]
 
     def added(self, around: Int[Tensor, "*B N"], tables: Float[Tensor, "R C"]) -> Float[Tensor, "*B C"]:
         """Return the sum over the tokens around; -1 is none."""
@@ -231,7 +224,7 @@ class CausalTransformer(Transformer):
         num_tokens: number of different tokens.
         grid_size: rows and columns of the grid whose tokens it predicts: one sequence row by row, or windows of it
             column by column (``config.window_columns``).
-        code_features: features of every code, by which codes share weights; wanted if ``config.code_features``.
+        code_features: what codes stand for, by which they share weights; wanted if ``config.code_features``.
 
     Attributes:
         windows: the windows over the grid; None where the grid is one sequence.
@@ -242,7 +235,7 @@ class CausalTransformer(Transformer):
         config: TransformerConfig,
         num_tokens: int,
         grid_size: tuple[int, int],
-        code_features: Float[Tensor, "K F"] | None = None,
+        code_features: CodeFeatures | None = None,
     ) -> None:
         if config.code_features and code_features is None:
             cure = "take the tokenizer nearest_range, or leave it out"
@@ -269,7 +262,13 @@ class CausalTransformer(Transformer):
             tokens: sequences that begin with the start token.
             columns: numbers in the grid of the columns of windows; None where the grid is one sequence.
         """
-        return self._logits(self.embedded(tokens, columns))
+        return self.head(self._read(self.embedded(tokens, columns)))
+
+    def nats(
+        self, read: Int[Tensor, "B T"], tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
+    ) -> Float[Tensor, "B T"]:
+        """Return the negative log-likelihood of one token at each position of sequences that are read as by forward."""
+        return self.head.nats(self._read(self.embedded(read, columns)), tokens)
 
     def embedded(
         self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
@@ -277,7 +276,7 @@ class CausalTransformer(Transformer):
         """Return what the blocks read."""
         embedding = self.embedding()
         x = F.embedding(tokens, embedding) + self.positions(columns)[..., : tokens.shape[1], :]
-        return x if self.around is None else x + self.around(tokens, self.around.tables(embedding))
+        return x if self.around is None else x + self.around(tokens, embedding)
 
     def positions(self, columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "*B T C"]:
         """Return what is learned of each position of a sequence, or of windows at these columns of the grid."""

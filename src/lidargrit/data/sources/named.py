@@ -20,7 +20,7 @@ from lidargrit.data.sources.source import Source
 from lidargrit.data.windows import TimedScan
 from lidargrit.scans.many_scans import usable_scans
 from lidargrit.scans.projection import unproject
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 
 _NUMBER = re.compile(r"-?\d[\d.,]*")
@@ -55,6 +55,10 @@ class NamedScans(ABC):
     @abstractmethod
     def timed_scans(self) -> list[TimedScan]:
         """Return when and where each scan was made, where that is known."""
+
+    @abstractmethod
+    def sensor(self) -> SensorModel | None:
+        """Return the sensor on whose rays the points lie; None where none is named, and readers would take that one."""
 
     def path(self, index: int) -> Path | None:
         """Return the file that holds the points of a scan; None where there is none."""
@@ -116,6 +120,10 @@ class PointScans(NamedScans):
                     self._told.add(kind)
                     reporting.message(f"{printable(of)}: {note}")
 
+    def sensor(self) -> SensorModel | None:
+        """Return the sensor of the data set, unless it is the one that a folder's scans are taken to be of."""
+        return None if self._dataset.sensor == Folder.sensor else load_sensor(self._dataset.sensor)
+
     def path(self, index: int) -> Path | None:
         """Return its file."""
         return self._dataset.path(self._indices[index])
@@ -164,6 +172,10 @@ class ImageScans(NamedScans):
     def scan(self, index: int) -> Scan:
         """Return a point for each return."""
         return unproject(self.image(index))
+
+    def sensor(self) -> SensorModel:
+        """Return the sensor of the images."""
+        return self.images.sensor
 
     def tell_notes(self, scan: Scan) -> None:
         """Report nothing: pixels have no notes."""

@@ -12,6 +12,7 @@ from torch import Tensor
 from lidargrit.core import discovery
 from lidargrit.core.configuration import NamedConfig
 from lidargrit.generation.objective import Objective
+from lidargrit.nn.codes import CodeFeatures
 from lidargrit.nn.precision import Precision
 from lidargrit.nn.quantiser import VectorQuantiser
 from lidargrit.scans.sensors import SensorModel
@@ -67,7 +68,7 @@ class Tokenizer(Objective, Generic[Config]):
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan as :meth:`for_decoding` does."""
 
-    def code_features(self) -> Float[Tensor, "K F"] | None:
+    def code_features(self) -> CodeFeatures | None:
         """Return numbers that tell what every code stands for, where that is known without training; else None."""
         return None
 

@@ -14,6 +14,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig
+from lidargrit.nn.codes import CodeFeatures
 from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.flops import flops_of
 from lidargrit.scans.example import Example
@@ -151,15 +152,15 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         components = torch.stack([part.movedim(-1, 1) for part in parts], 1)
         return Decoded(mixture.mode(), return_logits, self.sensor, features=features, components=components)
 
-    def code_features(self) -> Float[Tensor, "K F"]:
-        """Return of every code waves and bumps over its level, the states of its parts, and emptiness."""
+    def code_features(self) -> CodeFeatures:
+        """Return of every code waves and bumps over its level, the states of its parts, and emptiness; levels group."""
         config = self.config
         code = torch.arange(config.num_codes - 1)
         level, states = (code // config.num_patterns)[:, None].float(), self.states[code % config.num_patterns]
         waves = math.pi / config.levels * level * torch.arange(1, _WAVES + 1)
         bumps = torch.exp(-0.5 * ((level - torch.arange(0, config.levels, _BUMP_LEVELS)) / _BUMP_LEVELS) ** 2)
         of_codes = torch.cat((waves.sin(), waves.cos(), bumps, states == _NEAREST, states == _DROPPED), 1)
-        return torch.block_diag(torch.ones(1, 1), of_codes)
+        return CodeFeatures(torch.block_diag(torch.ones(1, 1), of_codes), config.num_patterns)
 
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan."""

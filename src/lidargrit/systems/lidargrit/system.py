@@ -258,8 +258,7 @@ def nats_of_tokens(transformer: CausalTransformer, grid: Int[Tensor, "B h w"]) -
 def _nats(
     transformer: CausalTransformer, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
 ) -> Float[Tensor, "B T"]:
-    logits = transformer(after_start(tokens[:, :-1]), columns)
-    return F.cross_entropy(logits.float().flatten(0, 1), tokens.flatten(), reduction="none").view_as(tokens)
+    return transformer.nats(after_start(tokens[:, :-1]), tokens, columns)
 
 
 def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:

@@ -161,7 +161,7 @@ def generate_tokens(
     transformer: MaskedTransformer, rngs: Sequence[torch.Generator], sampling: MaskedSampling
 ) -> Int[Tensor, "B T"]:
     """Generate one sequence for each random generator; all tokens are hidden at first, fewer after each pass."""
-    device, length = transformer.head.weight.device, transformer.context_length
+    device, length = transformer.pos_emb.device, transformer.context_length
     tokens = torch.full((len(rngs), length), transformer.mask_token, device=device)
     schedule = numbers_hidden(length, sampling.steps)
     for done, left in enumerate(schedule, start=1):
