@@ -75,7 +75,7 @@ def recomputing(transformer: CausalTransformer, batch: int, repeats: int) -> flo
 def step_bytes(transformer: CausalTransformer, batch: int, precision: str) -> float:
     """Return the bytes that a step reads, in the mean over all: weights once, keys and values of half the length."""
     sizes = transformer.config
-    blocks, head = 12 * sizes.layers * sizes.width**2, sizes.width * transformer.num_tokens
+    blocks, head = 12 * sizes.layers * sizes.width**2, sum(each.numel() for each in transformer.head.parameters())
     cached = 2 * sizes.layers * sizes.width * (transformer.context_length + 1) / 2 * batch
     number = 4 if precision == "fp32" else 2
     return blocks * (1 if precision == "int8" else number) + (head + cached) * number

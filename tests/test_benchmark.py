@@ -283,7 +283,7 @@ def test_counted_operations_are_those_of_a_step_that_is_computed(preset, stage):
 SMALL = "ultralidar_small lidargen_small r2flow_small maskgit_small lidm_small lidargrit_small_pixels lidarvae_small"
 
 
-@pytest.mark.parametrize("preset", [*SMALL.split(), "dusty_kitti_odometry"])
+@pytest.mark.parametrize("preset", [*SMALL.split(), "dusty_kitti_odometry", "lidargrit_fine_wide"])
 def test_operations_are_counted_without_computing_them(preset, monkeypatch):
     """Else a dry run of a wide network takes minutes: frozen networks, caches and counters count, too."""
     monkeypatch.delattr(compute, "_cost_with_values")

@@ -398,12 +398,3 @@ def test_a_tree_is_written_without_times_that_do_not_rise_or_are_not_known_of_al
     layout.write_motions(["sequences/00/velodyne/000000.bin", "sequences/00/velodyne/000001.bin"], [Motion(1.0)] * 2)
     assert heard[1:] == ["sequence 00 is written without times, which do not rise from scan to scan"]
     assert not (tmp_path / "other").exists()
-
-
-def test_points_of_another_sensor_than_kittis_tell_it_to_who_reads_them_back(tmp_path):
-    for kind, count in (("ply", 1), ("kitti_odometry", 1)):
-        assert export_scans("simulated:1@vlp16", tmp_path / kind, kind, DataConfig(max_scans=1)) == count
-    assert open_source(str(tmp_path / "ply")).sensor.height == 16
-    assert open_source(f"kitti_odometry:{tmp_path / 'kitti_odometry'}").sensor.height == 16
-    export_scans("simulated:1", tmp_path / "kittis", "ply")
-    assert not (tmp_path / "kittis" / SENSOR_FILE).exists(), "a folder is read as of this sensor"

@@ -1,4 +1,4 @@
-"""Files beside scans, and files of other programs: pictures are no scans, and what is not read is told."""
+"""Files beside scans: pictures are no scans, what is not read is told, and ``sensor.json`` names the sensor."""
 
 import struct
 from pathlib import Path
@@ -9,8 +9,14 @@ from PIL import Image
 
 from lidargrit.cli import main
 from lidargrit.core.errors import DataError, ScanError
-from lidargrit.data.datasets import open_dataset
+from lidargrit.data.datasets import load, open_dataset
+from lidargrit.data.datasets.shared.files import SENSOR_FILE
+from lidargrit.data.export import export_scans
 from lidargrit.data.formats import cure_of_ending, is_of_other_program, read_scan
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import open_source
+from lidargrit.data.sources.named import PointScans, named_scans
+from lidargrit.scans.sensors import load_sensor
 from street_corner import corner, xyz_of
 
 TABLE = corner()
@@ -176,3 +182,24 @@ def test_a_link_in_place_of_a_file_is_not_taken_as_written(tmp_path, capsys):
     (tmp_path / "out" / "a.pcd").symlink_to(tmp_path / "a.bin")
     assert main(words) == 2
     assert "a.pcd, which is a link; wanted a file of this command, or none; remove the link" in capsys.readouterr().err
+
+
+def test_points_of_another_sensor_than_kittis_tell_it_to_who_reads_them_back(tmp_path):
+    for kind, count in (("ply", 1), ("kitti_odometry", 1)):
+        assert export_scans("simulated:1@vlp16", tmp_path / kind, kind, DataConfig(max_scans=1)) == count
+    assert open_source(str(tmp_path / "ply")).sensor.height == 16
+    assert open_source(f"kitti_odometry:{tmp_path / 'kitti_odometry'}").sensor.height == 16
+    export_scans("simulated:1", tmp_path / "kittis", "ply")
+    assert not (tmp_path / "kittis" / SENSOR_FILE).exists(), "a tree is read as of this sensor"
+
+
+def test_a_sensor_that_is_not_known_is_not_told_and_a_foreign_file_of_that_name_does_not_stop_an_export(tmp_path):
+    export_scans("simulated:1", tmp_path / "scans", "bin")
+    (tmp_path / "scans" / SENSOR_FILE).write_text('{"token": 1}', encoding="utf-8")
+    assert export_scans(str(tmp_path / "scans"), tmp_path / "foreign", "ply") == 1
+    assert not (tmp_path / "foreign" / SENSOR_FILE).exists()
+    assert named_scans(open_source("simulated:1@vlp16"), DataConfig()).sensor() == load_sensor("vlp16")
+    of_several = open_source("simulated:1@vlp16").scans()
+    of_several.sensors_differ = True
+    assert PointScans(of_several, 1).sensor() is None
+    assert all(load(name).sensors_differ for name in ("ncore", "py123d", "ouster"))

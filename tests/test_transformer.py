@@ -9,9 +9,10 @@ import torch
 from scipy import stats
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.nn.codes import CodeFeatures, GroupedCodeHead
+from lidargrit.nn.codes import CodeFeatures, CodeHead, GroupedCodeHead
 from lidargrit.nn.decoding import CachedDecoder
-from lidargrit.nn.transformer import CausalTransformer, TransformerConfig, resample_positions
+from lidargrit.nn.flops import flops_of
+from lidargrit.nn.transformer import CausalTransformer, TokensAround, TransformerConfig, resample_positions
 from lidargrit.systems.lidargrit.system import START_TOKEN, TokenSampling, after_start, sample_token
 from reference_weights import seeded_weights
 
@@ -99,9 +100,22 @@ def without_attention(transformer, block):
     return weaker
 
 
+@pytest.fixture
+def sharing():
+    """A transformer whose codes share weights, far from uniform."""
+    torch.manual_seed(0)
+    config = TransformerConfig(layers=2, heads=4, width=32, code_features=True)
+    made = CausalTransformer(config, num_tokens=21, grid_size=(1, 24), code_features=CODE_FEATURES).eval()
+    for weight in (*made.head.parameters(), made.pos_emb):
+        torch.nn.init.normal_(weight, std=0.3)
+    return made
+
+
+@pytest.mark.parametrize("head", ["transformer", "sharing"])
 @pytest.mark.parametrize("guidance", [1.0, 1.5])
 @pytest.mark.parametrize(("precision", "tolerance"), [("fp32", 1e-5), ("bf16", 0.2), ("int8", 0.2)])
-def test_steps_give_the_logits_of_the_whole_prefix(transformer, precision, tolerance, guidance):
+def test_steps_give_the_logits_of_the_whole_prefix(head, precision, tolerance, guidance, request):
+    transformer = request.getfixturevalue(head)
     tokens = torch.randint(20, (3, 24), generator=torch.Generator().manual_seed(0))
     by_choices = partial(sample_token, sampling=GREEDY)
     decoder = CachedDecoder(transformer, 3, by_choices, precision=precision, guidance=guidance)
@@ -190,6 +204,27 @@ def test_a_grouped_head_is_a_loop_over_its_groups_and_all_its_probabilities_are_
     assert torch.allclose(logits.exp().sum(-1), torch.ones(3, 21), atol=1e-5)
     assert torch.allclose(nats, -wanted.gather(-1, codes[..., None])[..., 0], atol=1e-5)
     assert wanted.std() > 1
+
+
+def test_operations_of_a_head_are_those_that_torch_counts():
+    for head in (CodeHead(8, 21), GroupedCodeHead(8, num_codes=21, group_size=4)):
+        assert head.flops == flops_of(head, (1, 8))
+    with pytest.raises(ConfigError, match="20 codes in groups of 4"):
+        GroupedCodeHead(8, num_codes=20, group_size=4)
+
+
+def test_tokens_around_are_the_same_mapped_by_code_and_by_token():
+    torch.manual_seed(0)
+    around, embedding = TokensAround((4, 6), 8, wraps=True), torch.randn(24, 8)
+    tokens, found = torch.randint(24, (1, 24)), []
+    for enabled in (False, True):
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            found += [around(tokens, embedding), around.added(around.around(tokens), around.tables(embedding))]
+    gradients = [torch.autograd.grad(each.square().sum(), around.maps)[0] for each in found]
+    for these in (found, gradients):
+        assert torch.allclose(these[0], these[1], atol=1e-4)
+        assert torch.allclose(these[2], these[3], atol=0.03 * float(these[0].detach().abs().max()))
+    assert all(each.dtype == torch.float32 for each in found)
 
 
 def test_codes_of_a_group_learn_from_those_at_the_same_place_in_others():

@@ -33,7 +33,7 @@ def export_scans(
 
     Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
     names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
-    which scan, and ``sensor.json`` on which rays points lie, unless a folder's scans are taken to be of that sensor.
+    which scan, and ``sensor.json`` on which rays points lie, if that is known and is not KITTI's HDL-64E.
 
     Args:
         source: samples of ours or of another program, a prepared folder, or a source of scans.
@@ -62,13 +62,12 @@ def export_scans(
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     told_by_format = isinstance(layout, _Flat) and layout.tells_sensor
-    seen_by = change.other if isinstance(change, Rescan) else scans.sensor()
-    sensor = None if told_by_format else seen_by
+    sensor = change.other if isinstance(change, Rescan) else scans.sensor()
     with folder.writing("exporting") as progress:
         for index in folder.missing:
             with folder.leaving_out(index):
                 scan = read(index)
-                if sensor is not None:  # only now: a folder without any scan is left free
+                if sensor is not None and not told_by_format:  # only now: a folder without any scan is left free
                     folder.tell_sensor(sensor)
                 layout.write(files[index], scan)
                 if scan.label is not None and not layout.keeps_labels:

@@ -7,6 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lidargrit.core.errors import ConfigError
+
 _FEATURES_LENGTH = 3.0  # of each code's: what codes share then moves more quickly than what each has of its own
 
 
@@ -52,6 +54,9 @@ class GroupedCodeHead(nn.Module):
 
     def __init__(self, width: int, num_codes: int, group_size: int) -> None:
         super().__init__()
+        if (num_codes - 1) % group_size:
+            got = f"{num_codes} codes in groups of {group_size}"
+            raise ConfigError(got, "code 0 and whole groups", "choose another size of the groups")
         self.group_size, self.width = group_size, width
         self.num_groups = (num_codes - 1) // group_size
         self.group = nn.Linear(width, 1 + self.num_groups, bias=False)

@@ -29,7 +29,7 @@ def at_least_32_bits(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 def as_in_products(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return numbers as products with them are computed here: in the 16 bits of autocast, or as they are."""
-    kind = x.device.type
+    kind = "cpu" if x.device.type == "meta" else x.device.type
     return x.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else x
 
 

@@ -106,14 +106,14 @@ class TransformerConfig(Settings):
 
 
 class Transformer(Network):
-    """Pre-norm blocks, learned positions, exact GELU, an untied head without bias.
+    """Pre-norm blocks, learned positions, exact GELU, an untied head, without bias unless codes share weights.
 
     Args:
         num_inputs: number of different tokens that it reads.
         num_tokens: number of different tokens that it predicts.
         context_length: number of tokens in the longest sequence.
         causal: whether a token attends only to itself and to those before it.
-        code_features: what codes stand for, by which they share weights; None where each has its own alone.
+        code_features: meaning of every code, by which codes share weights; None where each has its own alone.
 
     Source:
         Haghighi et al., LidarGRIT, 2024, section 3.3; layers as in hamedhaghighi/LidarGRIT@a3f86e7.
@@ -135,9 +135,11 @@ class Transformer(Network):
         self.drop = nn.Dropout(config.embedding_dropout)
         self.blocks = nn.ModuleList(TransformerBlock(config, causal) for _ in range(config.layers))
         self.ln_f = nn.LayerNorm(config.width)
-        self.head: CodeHead | GroupedCodeHead = CodeHead(config.width, num_tokens)
+        self.head: CodeHead | GroupedCodeHead
         self.shared: SharedEmbedding | None = None
-        if code_features is not None:
+        if code_features is None:
+            self.head = CodeHead(config.width, num_tokens)
+        else:
             self.head = GroupedCodeHead(config.width, num_tokens, code_features.group_size)
             self.shared = SharedEmbedding(code_features.of_codes, config.width)
         self.apply(_initialise)
@@ -224,7 +226,7 @@ class CausalTransformer(Transformer):
         num_tokens: number of different tokens.
         grid_size: rows and columns of the grid whose tokens it predicts: one sequence row by row, or windows of it
             column by column (``config.window_columns``).
-        code_features: what codes stand for, by which they share weights; wanted if ``config.code_features``.
+        code_features: meaning of every code, by which codes share weights; wanted if ``config.code_features``.
 
     Attributes:
         windows: the windows over the grid; None where the grid is one sequence.
@@ -255,20 +257,21 @@ class CausalTransformer(Transformer):
             if self.shared is not None:
                 self.around.maps.data *= _AROUND_IF_SHARED
 
-    def forward(self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "B T K"]:
-        """Return the logits of the next token at each position.
+    def forward(
+        self,
+        tokens: Int[Tensor, "B T"],
+        columns: Int[Tensor, "*B W"] | None = None,
+        next_tokens: Int[Tensor, "B T"] | None = None,
+    ) -> Float[Tensor, "B T *K"]:
+        """Return the logits of the next token at each position; or of given next tokens the nats, which is quicker.
 
         Args:
             tokens: sequences that begin with the start token.
             columns: numbers in the grid of the columns of windows; None where the grid is one sequence.
+            next_tokens: the token that follows each, of which the negative log-likelihood is returned.
         """
-        return self.head(self._read(self.embedded(tokens, columns)))
-
-    def nats(
-        self, read: Int[Tensor, "B T"], tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
-    ) -> Float[Tensor, "B T"]:
-        """Return the negative log-likelihood of one token at each position of sequences that are read as by forward."""
-        return self.head.nats(self._read(self.embedded(read, columns)), tokens)
+        x = self._read(self.embedded(tokens, columns))
+        return self.head(x) if next_tokens is None else self.head.nats(x, next_tokens)
 
     def embedded(
         self, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None

@@ -67,6 +67,8 @@ class ScanDataset(ABC):
     """The paper that describes it."""
     sensor: str
     """Name of the sensor that made the scans."""
+    sensors_differ: ClassVar[bool] = False
+    """Whether its scans may be of other sensors than :attr:`sensor`, which is then the commonest."""
     notes: tuple[str, ...] = ()
     """Sentences on files that were left out."""
     schemes: ClassVar[dict[str, SplitScheme]] = {}

@@ -35,6 +35,7 @@ class Ncore(LibraryDataset):
     licence = "that of your files"
     tree = "ROOT/NAME.ncore4*.zarr.itar, or one folder deeper"
     sensor = "os1_128"
+    sensors_differ = True
     citation = "none: your recordings"
     library = "nvidia-ncore"
     patterns = ("*.ncore4*.zarr.itar", "*/*.ncore4*.zarr.itar")

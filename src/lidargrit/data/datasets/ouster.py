@@ -21,6 +21,7 @@ class Ouster(FileDataset):
     licence = "that of your files"
     tree = "ROOT/NAME.pcap with ROOT/NAME.json, or both one folder deeper"
     sensor = "os1_128"
+    sensors_differ = True
     format = "ouster_pcap"
     citation = "none: your recordings"
     patterns = ("*.pcap", "*/*.pcap")

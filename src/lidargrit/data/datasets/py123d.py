@@ -33,6 +33,7 @@ class Py123d(LibraryDataset):
     licence = "that of the data set that was converted"
     tree = "ROOT/SPLIT/LOG/sync.arrow with LOG/lidar*.arrow"
     sensor = "hdl64e_kitti_360"
+    sensors_differ = True
     citation = "that of the data set that was converted"
     library = "py123d"
     patterns = ("*/*/sync.arrow", "*/*/*/sync.arrow")

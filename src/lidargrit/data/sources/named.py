@@ -3,12 +3,13 @@
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import OutputError, printable
+from lidargrit.core.errors import ConfigError, OutputError, printable
 from lidargrit.data.datasets import ScanDataset, Window
 from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import read_scan
@@ -58,7 +59,7 @@ class NamedScans(ABC):
 
     @abstractmethod
     def sensor(self) -> SensorModel | None:
-        """Return the sensor on whose rays the points lie; None where none is named, and readers would take that one."""
+        """Return the sensor on whose rays the points lie, where it is known and is not KITTI's HDL-64E."""
 
     def path(self, index: int) -> Path | None:
         """Return the file that holds the points of a scan; None where there is none."""
@@ -121,8 +122,12 @@ class PointScans(NamedScans):
                     reporting.message(f"{printable(of)}: {note}")
 
     def sensor(self) -> SensorModel | None:
-        """Return the sensor of the data set, unless it is the one that a folder's scans are taken to be of."""
-        return None if self._dataset.sensor == Folder.sensor else load_sensor(self._dataset.sensor)
+        """Return the sensor of the data set, unless it may have several or the file that names it is no sensor's."""
+        if self._dataset.sensors_differ or self._dataset.sensor == Folder.sensor:
+            return None
+        with suppress(ConfigError):
+            return load_sensor(self._dataset.sensor)
+        return None
 
     def path(self, index: int) -> Path | None:
         """Return its file."""

@@ -258,7 +258,7 @@ def nats_of_tokens(transformer: CausalTransformer, grid: Int[Tensor, "B h w"]) -
 def _nats(
     transformer: CausalTransformer, tokens: Int[Tensor, "B T"], columns: Int[Tensor, "*B W"] | None = None
 ) -> Float[Tensor, "B T"]:
-    return transformer.nats(after_start(tokens[:, :-1]), tokens, columns)
+    return transformer(after_start(tokens[:, :-1]), columns, tokens)
 
 
 def after_start(tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T+1"]:
