@@ -228,7 +228,7 @@ PRESETS = {
                 decoded_components=True,
                 weighed_components=True,
                 own_context=0.5,
-                range_temperature=0.2,
+                range_temperature=0.03,  # own_context widens the mixtures
             ),
         ),
         tokenizer=replace(_RELAYED, scans=10_000, learning_rate=2e-3, augmentations=("flip",)),
