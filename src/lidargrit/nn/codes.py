@@ -44,7 +44,7 @@ class GroupedCodeHead(nn.Module):
     """The group of the next code, and given that which code of the group it is.
 
     The likelihood of one code takes the logits of all groups and of one group's codes. With 128 groups of 65 codes that
-    is a fiftieth of one logit a code, and a rare code is learned from those like it in all groups.
+    is an eighteenth of the operations of a logit for each code, and a rare code is learned from those like it.
 
     Args:
         width: length of the vector that stands for a position.
