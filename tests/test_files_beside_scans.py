@@ -185,8 +185,8 @@ def test_a_link_in_place_of_a_file_is_not_taken_as_written(tmp_path, capsys):
 
 
 def test_points_of_another_sensor_than_kittis_tell_it_to_who_reads_them_back(tmp_path):
-    for kind, count in (("ply", 1), ("kitti_odometry", 1)):
-        assert export_scans("simulated:1@vlp16", tmp_path / kind, kind, DataConfig(max_scans=1)) == count
+    for kind in ("ply", "kitti_odometry"):
+        assert export_scans("simulated:1@vlp16", tmp_path / kind, kind) == 1
     assert open_source(str(tmp_path / "ply")).sensor.height == 16
     assert open_source(f"kitti_odometry:{tmp_path / 'kitti_odometry'}").sensor.height == 16
     export_scans("simulated:1", tmp_path / "kittis", "ply")

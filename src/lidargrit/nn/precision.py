@@ -29,13 +29,17 @@ def at_least_32_bits(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
 
 def as_in_products(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
     """Return numbers as products with them are computed here: in the 16 bits of autocast, or as they are."""
-    kind = "cpu" if x.device.type == "meta" else x.device.type
+    kind = _kind_of(x.device)
     return x.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else x
 
 
 def without_autocast(device: torch.device) -> AbstractContextManager[object]:
     """Compute in the numbers' own precision within the ``with`` block, whatever the training has chosen around it."""
-    return torch.autocast("cpu" if device.type == "meta" else device.type, enabled=False)
+    return torch.autocast(_kind_of(device), enabled=False)
+
+
+def _kind_of(device: torch.device) -> str:
+    return "cpu" if device.type == "meta" else device.type  # autocast knows no tensors without values
 
 
 @contextmanager

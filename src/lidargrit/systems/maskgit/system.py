@@ -106,7 +106,7 @@ class MaskGit(TokenGenerator[MaskGitConfig, MaskedSampling]):
         # Per token and layer: four projections and a perceptron of four times the width, then queries by keys and
         # weights by values over all tokens.
         layer = 24 * sizes.width**2 + 4 * sizes.width * tokens
-        one_pass = tokens * (sizes.layers * layer + 2 * sizes.width * self.transformer.num_tokens)
+        one_pass = tokens * (sizes.layers * layer + self.transformer.head.flops)
         passes = len(numbers_hidden(tokens, sampling.steps))
         decoding = self.decoding_cost(sampling.mask)
         return Cost(passes + decoding.network_evaluations, passes * one_pass + decoding.flops)
