@@ -147,7 +147,6 @@ STEPS = {  # of each stage of the smallest networks, for two scans of 64x32: ker
     "maskgit/tokenizer": (720, 0, 0),
     "maskgit/transformer": (130, 0, 0),
     "multiscale/pixels": (1480, 0, 0),
-    "pyramid/levels": (2500, 1, 0),
     "r2dm/diffusion": (570, 0, 0),
     "r2flow/flow": (880, 0, 0),
 }
@@ -164,15 +163,15 @@ def test_noise_is_made_on_the_device_and_is_that_of_the_cpu() -> None:
             assert torch.equal(image.cpu(), wanted)
 
 
-def test_levels_of_a_pyramid_choose_their_phases_by_one_source_of_random_numbers() -> None:
+def test_lattices_choose_their_phases_by_one_source_of_random_numbers() -> None:
     sensor = load_sensor("hdl64e_kitti_odometry").with_columns(32)
-    cls = load_class("pyramid")
-    objective = cls(cls.smallest_config(sensor), sensor).objective("levels")
+    cls = load_class("multiscale")
+    objective = cls(cls.smallest_config(sensor), sensor).objective("pixels")
     with patch.object(pixel_decoder, "one_of_phases", wraps=pixel_decoder.one_of_phases) as choose, counted():
         objective.to(DEVICE)(Example(uniform_images(sensor, 8)).to(DEVICE), PretendedGenerator().manual_seed(0))
     sources = [call.args[1] for call in choose.call_args_list]
     assert len(sources) > 1
-    assert all(source is sources[0] for source in sources), "levels would choose alike"
+    assert all(source is sources[0] for source in sources), "lattices would choose alike"
 
 
 @pytest.mark.parametrize("stage", STEPS)

@@ -26,7 +26,6 @@ from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset
 from lidargrit.generation.tokens import TokenGenerator
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.pyramid.system import Pyramid
 from lidargrit.training.checkpoint import fingerprint
 from lidargrit.training.stage import StageTraining
 
@@ -151,19 +150,13 @@ def _fit(
 
 @torch.no_grad()
 def _judged(generator: Generator, stage: str, truth: RangeImage, device: torch.device) -> Iterator[tuple[str, float]]:
-    """Yield what the first stage keeps of streets: ranges, and poles and trunks where they stood.
-
-    Of a pyramid it is what the two finest levels make of the true coarser ones: 4,096 ranges of 64x1024.
-    """
+    """Yield what the first stage keeps of streets: ranges, and poles and trunks where they stood."""
     generator.to(device).eval()
-    if isinstance(generator, Pyramid):
-        whole = generator.resample(truth, range(len(truth))).to("cpu")
-    elif isinstance(generator, TokenGenerator) and stage in _FIRST_STAGE:
-        whole = RangeImage.cat(
-            [_from_tokens(generator, stage, truth[[index]].to(device), index) for index in range(len(truth))]
-        )
-    else:
+    if not isinstance(generator, TokenGenerator) or stage not in _FIRST_STAGE:
         return
+    whole = RangeImage.cat(
+        [_from_tokens(generator, stage, truth[[index]].to(device), index) for index in range(len(truth))]
+    )
     both = truth.return_mask & whole.return_mask
     error_m = (whole.range_m - truth.range_m).abs()
     kept = kept_objects(truth, whole)

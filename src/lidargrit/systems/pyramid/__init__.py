@@ -1,1 +1,0 @@
-"""The system ``pyramid``; see system.py."""
