@@ -120,6 +120,14 @@ def test_the_terms_are_those_of_a_loop():
     assert float(terms["mean_iou"]) == pytest.approx(sum(iou) / len(iou), rel=1e-5)
 
 
+def test_attention_that_the_network_cannot_have_is_refused():
+    with pytest.raises(ConfigError, match="2 layers of attention of 4 heads, 96 channels; wanted at most 1 layers"):
+        SegmenterNetworkConfig(blocks=1, attention_layers=2)
+    with pytest.raises(ConfigError, match="heads that divide the channels"):
+        SegmenterNetworkConfig(heads=5)
+    assert SegmenterNetworkConfig(attention_layers=0, heads=5).heads == 5  # of no layer, as saved runs may have them
+
+
 def test_a_resumed_training_gives_the_same_weights(run):
     one, other = (open_segmenter(str(run / name), "cpu") for name in ("whole", "resumed"))
     for name, weight in one.state_dict().items():

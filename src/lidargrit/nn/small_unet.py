@@ -8,7 +8,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
@@ -27,20 +29,33 @@ def check_size(rows: int, columns: int, wanted_by: str) -> None:
 
 
 @dataclass(frozen=True)
-class SmallUnetConfig:
-    """Sizes of the U-Net.
+class SmallUnetConfig(Settings):
+    """Sizes of the U-Net, and base of the settings of networks around one.
 
     Args:
-        widths: channels at a half, a quarter and an eighth of the image's rows and columns.
-        blocks: residual blocks at an eighth.
-        attention_layers: layers of attention between all pixels at an eighth, among the residual blocks.
-        heads: attention heads of each layer.
+        widths: numbers of channels at a half, a quarter and an eighth of the image's rows and columns.
+        blocks: number of residual blocks at an eighth of the image's size.
+        attention_layers: number of attention layers between all pixels at an eighth of the image's size, among the
+            residual blocks.
+        heads: number of attention heads of each layer.
+
+    Raises:
+        ConfigError: more layers of attention than residual blocks, or heads that do not divide the last width.
     """
 
-    widths: tuple[int, int, int]
-    blocks: int
-    attention_layers: int = 0
-    heads: int = 1
+    widths: tuple[Count, Count, Count]
+    blocks: Count
+    attention_layers: NotNegative = 0
+    heads: Count = 1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.attention_layers > self.blocks or (self.attention_layers and self.widths[-1] % self.heads):
+            raise ConfigError(
+                f"{self.attention_layers} layers of attention of {self.heads} heads, {self.widths[-1]} channels",
+                f"at most {self.blocks} layers, one after each residual block, and heads that divide the channels",
+                "change attention_layers, blocks, heads or the last of widths",
+            )
 
 
 class Part(NamedTuple):

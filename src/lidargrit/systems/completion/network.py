@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidargrit.core.configuration import Settings
-from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
@@ -38,15 +36,12 @@ _ONE_SURFACE = 0.1  # of ln(1 + range): a return so much farther or nearer than 
 
 
 @dataclass(frozen=True)
-class CompletionNetworkConfig(Settings):
-    """Sizes of the network that completes scans.
+class CompletionNetworkConfig(SmallUnetConfig):
+    """Sizes of the network that completes scans, those of its U-Net among them.
+
+    Attention fills a wide gap by what stands on the other side of the street, too.
 
     Args:
-        widths: numbers of channels at a half, a quarter and an eighth of the image's rows and columns.
-        blocks: number of residual blocks at an eighth of the image's size.
-        attention_layers: number of attention layers between all pixels at an eighth of the image's size, among the
-            residual blocks: a wide gap is filled by what stands on the other side of the street, too.
-        heads: number of attention heads of each layer.
         features: number of channels that the phases of the mask see.
         mask_width: number of channels of the layers of the mask's phases.
         row_channels: number of learned values of every row.
@@ -68,15 +63,6 @@ class CompletionNetworkConfig(Settings):
     any_sensor: bool = False
     labels: bool = False
     reflectance: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.attention_layers > self.blocks or self.widths[-1] % self.heads:
-            raise ConfigError(
-                f"{self.attention_layers} layers of attention of {self.heads} heads, {self.widths[-1]} channels",
-                f"at most {self.blocks} layers, one after each residual block, and heads that divide the channels",
-                "change model.completion.attention_layers or .heads",
-            )
 
 
 class CompletionOutput(NamedTuple):
@@ -110,7 +96,6 @@ class CompletionNetwork(RayNetwork):
         self.config = config
         self.limits_v = (math.log1p(sensor.range_min_m), math.log1p(sensor.range_max_m))
         self._tell_rays(config.row_channels)
-        sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
         self.classes = ClassMaps(_CLASS_CHANNELS) if config.labels else None
         self.outputs = [config.features, NUM_CANDIDATES, 1, 1]
         parts = {}
@@ -118,7 +103,7 @@ class CompletionNetwork(RayNetwork):
             parts["labels"] = Part(NUM_LABELS * _CLASS_CHANNELS, NUM_CLASSES + NUM_LABELS)
         if config.reflectance:
             parts["reflectance"] = Part(NUM_REFLECTANCES, 1 + NUM_REFLECTANCES)
-        self.unet = SmallUnet(sizes, NUM_MAPS + config.row_channels + 2, sum(self.outputs), parts)
+        self.unet = SmallUnet(config, NUM_MAPS + config.row_channels + 2, sum(self.outputs), parts)
         self.mask = MaskNetwork.behind(config.features, config.mask_width, self)
         preferred = torch.zeros(NUM_CANDIDATES)
         preferred[0] = _TRUST

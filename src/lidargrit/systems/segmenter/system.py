@@ -8,7 +8,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
-from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
@@ -31,14 +30,10 @@ _BEND, _BEND_STEPS = 0.005, 3.0  # a small bend relative to inverse range; scale
 
 
 @dataclass(frozen=True)
-class SegmenterNetworkConfig(Settings):
-    """Sizes of the segmenter's network, and what it sees.
+class SegmenterNetworkConfig(SmallUnetConfig):
+    """Sizes of the segmenter's network, those of its U-Net among them, and what it sees.
 
     Args:
-        widths: channels at a half, a quarter and an eighth of the image's rows and columns.
-        blocks: residual blocks at an eighth.
-        attention_layers: layers of attention between all pixels at an eighth, among the residual blocks.
-        heads: attention heads of each layer.
         reflectance: whether the network sees the reflectance of returns, where scans have it.
         bends: whether it sees how inverse range bends from each return's neighbour on the left to that on the right:
             not at all on a plane at whatever range, so that leaves do not look like walls.
@@ -50,12 +45,6 @@ class SegmenterNetworkConfig(Settings):
     heads: Count = 4
     reflectance: bool = True
     bends: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.attention_layers > self.blocks:
-            got = f"attention_layers={self.attention_layers}, blocks={self.blocks}"
-            raise ConfigError(got, "at most a layer of attention a block", "change one")
 
 
 class SegmenterNetwork(nn.Module):
@@ -70,9 +59,8 @@ class SegmenterNetwork(nn.Module):
         check_size(sensor.height, sensor.width, "a segmenter")
         self.config = config
         self.register_buffer("elevation_rad", sensor.elevation_rad.double().mean(1).float(), persistent=False)
-        sizes = SmallUnetConfig(config.widths, config.blocks, config.attention_layers, config.heads)
         parts = {"reflectance": Part(2, 0)} if config.reflectance else {}
-        self.unet = SmallUnet(sizes, _NUM_MAPS + config.bends, NUM_CLASSES, parts)
+        self.unet = SmallUnet(config, _NUM_MAPS + config.bends, NUM_CLASSES, parts)
 
     elevation_rad: Tensor
 
