@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
+from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice
 from lidargrit.generation.pixel_decoder.ray_encoding import RowEncoding, with_absent_rows
 from lidargrit.scans.condition import Observed
@@ -91,10 +92,16 @@ class RayNetwork(nn.Module, ABC):
         return torch.cat((of_rows, self.azimuth[None, :, None].expand(count, -1, height, -1)), 1)
 
 
-def told_rays_in_place_of_rows(weights: dict[str, Tensor], network: nn.Module) -> dict[str, Tensor]:
-    """Return those weights of a network of one sensor that one which is told its rays has, too: all but its rows'."""
-    own = network.state_dict()
-    return {name: weight for name, weight in weights.items() if name in own}
+class RayObjective(Objective):
+    """Base of objectives of networks that may be told the rays, which then go on from one of a single sensor, too."""
+
+    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
+        """Return the weights of a trained network, for any sensor without those of the rows of a single one."""
+        weights = super().weights_from(trained)
+        if not any(network.any_sensor for network in self.children() if isinstance(network, RayNetwork)):
+            return weights
+        own = self.state_dict()
+        return {name: weight for name, weight in weights.items() if name in own}
 
 
 def sharing_weights(made: ModuleT, trained: nn.Module) -> ModuleT:

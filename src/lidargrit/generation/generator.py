@@ -45,12 +45,13 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     Sampling: ClassVar[type] = SamplingSettings
     not_of_sampling: ClassVar[frozenset[str]] = frozenset()
     """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
-
     capabilities: ClassVar[frozenset[str]] = frozenset()
     own_batches: ClassVar[tuple[int, int]] = (1, 8)
     """Number of scans that are computed at once on a CPU, and on a GPU, where the caller names none."""
     is_random: ClassVar[bool] = True
     """Whether two seeds give two scans."""
+    has_new_scans: ClassVar[bool] = True
+    """Whether it samples scans of which nothing is known; else it only completes or labels those of others."""
     bundle: "Bundle[Generator[Any, Any]] | None" = None
     """Runs that complete scans in its place where it was read from a bundle."""
     facts: ClassVar[SystemFacts] = SystemFacts(generates="range images")
@@ -97,7 +98,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def takes(self) -> frozenset[type[Condition]]:
         """Types of conditions that :meth:`sample` takes; ``Nothing`` is among them if it has new scans to sample."""
-        return frozenset({Nothing, Observed} if "complete" in self.capabilities else {Nothing})
+        new = frozenset({Nothing} if self.has_new_scans else ())
+        return new | {Observed} if "complete" in self.capabilities else new
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:

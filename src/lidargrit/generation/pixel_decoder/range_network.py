@@ -108,9 +108,10 @@ class RangeNetwork(PhaseNetwork):
             parts.append(expected - TYPICAL_LOG_RANGE)
         if self.is_told and guide.told is not None:
             told = cells_of(guide.told[:, None].to(v.dtype), phases[0].lattice)
-            parts.append(generated * told * _near(beside))
+            parts.append(generated * told * bounded_difference(beside))
             if decoded is not None:
-                parts.append(at_phases(guide.told, phases)[:, :, None] * _near(decoded[:, :, 1] - expected))
+                from_expected = bounded_difference(decoded[:, :, 1] - expected)
+                parts.append(at_phases(guide.told, phases)[:, :, None] * from_expected)
         return torch.cat(parts, 2)
 
     def candidates(
@@ -184,6 +185,6 @@ def _agreement(around: Float[Tensor, "P B K h w"], decoded: Float[Tensor, "P B 3
     return ((logits.softmax(3) * near).sum(3) + _LEAST_AGREEMENT).log()
 
 
-def _near(apart: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
+def bounded_difference(apart: Float[Tensor, "*P"]) -> Float[Tensor, "*P"]:
     """Return differences in v between -1 and 1, so that small ones are told apart."""
     return apart / (apart.abs() + _NEAR_V)

@@ -106,7 +106,8 @@ def lay_out_houses(
             from_, to = np.append(span[0], start + length), np.append(start, span[1])
             gap = np.column_stack((from_, to, np.full(len(to), side)))
             gaps.append(gap[gap[:, 1] - gap[:, 0] > 1.5])
-    blocks = [_stand_along(rng, plan, *row) for row in rows]
+    blocks = [_stand_along(start, length, front, side, rng.uniform(*_DEPTH_M[plan.theme], len(start)))
+              for start, length, front, side in rows]  # fmt: skip
     blocks += [_stand_beside(rng, plan, street, side, flank) for street in plan.side_streets for side in street.sides
                for flank in (-1, 1)]  # fmt: skip
     blocks += _stand_across(rng, plan)
@@ -151,14 +152,9 @@ def _steps(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _stand_along(
-    rng: np.random.Generator,
-    plan: StreetPlan,
-    start: np.ndarray,
-    length: np.ndarray,
-    front: np.ndarray,
-    side: np.ndarray,
+    start: np.ndarray, length: np.ndarray, front: np.ndarray, side: np.ndarray, depth: np.ndarray
 ) -> tuple[Placements, np.ndarray, np.ndarray]:
-    depth = rng.uniform(*_DEPTH_M[plan.theme], len(start))
+    """Line our road with houses that face it, each from where it starts and with a front so far from the middle."""
     placements = Placements.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
     near, far = side * front, side * (front + depth)
     extent = np.column_stack((start, start + length, np.minimum(near, far), np.maximum(near, far)))
@@ -225,11 +221,7 @@ def _garages(rng: np.random.Generator, plan: StreetPlan, gaps: np.ndarray) -> tu
     side = gap[:, 2]
     front = np.where(side > 0, plan.front(1), -plan.front(-1)) + rng.uniform(0.5, 7.0, len(gap))
     start = gap[:, 0] + 0.1
-    depth = rng.uniform(5.0, 7.0, len(gap))
-    placements = Placements.of(start + length / 2, side * (front + depth / 2), np.where(side > 0, 0.0, np.pi))
-    near, far = side * front, side * (front + depth)
-    extent = np.column_stack((start, start + length, np.minimum(near, far), np.maximum(near, far)))
-    return placements, extent, np.column_stack((length, depth))
+    return _stand_along(start, length, front, side, rng.uniform(5.0, 7.0, len(gap)))
 
 
 def _stand_far(

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lidargrit.core.configuration import Settings
-from lidargrit.generation.any_sensor import told_rays_in_place_of_rows
+from lidargrit.generation.any_sensor import RayObjective
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -18,7 +18,7 @@ from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, reflectance_er
 from lidargrit.generation.semantic_classes import class_indices, labels_to_learn
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.random import of_host, rngs_of
-from lidargrit.scans.condition import Condition, Observed
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -36,7 +36,7 @@ _CLASS_WEIGHT, _REFLECTANCE_WEIGHT = 0.5, 2.0
 _MASK_WEIGHT, _ALONE_WEIGHT, _LOG_WEIGHT, _METRE_WEIGHT = 3.0, 0.5, 1.5, 0.3
 
 
-class CompletionObjective(Objective):
+class CompletionObjective(RayObjective):
     """The errors of the hidden pixels: of the range, and of the mask, by its likelihood in phases and pixel by pixel.
 
     Every scan has a random pattern: rows, all but a sector or a box, or single pixels. Scans are weighed by the square
@@ -49,11 +49,6 @@ class CompletionObjective(Objective):
     def __init__(self, network: CompletionNetwork, sensor: SensorModel) -> None:
         super().__init__(sensor)
         self.completion = network
-
-    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
-        """Return the weights of a trained network, for any sensor without those of the rows of a single one."""
-        weights = super().weights_from(trained)
-        return told_rays_in_place_of_rows(weights, self) if self.completion.any_sensor else weights
 
     def check(self, images: RangeImage) -> None:
         """Refuse images without the labels or the reflectance that are to be learned."""
@@ -170,6 +165,7 @@ class Completion(Generator[CompletionConfig, SamplingSettings]):
         first_command="complete SCANS completed --observed rows:4 --model RUN",
     )
     capabilities = frozenset({"complete"})
+    has_new_scans = False
 
     def __init__(self, config: CompletionConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -184,11 +180,6 @@ class Completion(Generator[CompletionConfig, SamplingSettings]):
     def objective(self, stage: str) -> Objective:
         """Return the errors of hidden pixels."""
         return CompletionObjective(self.completion, self.sensor)
-
-    @property
-    def takes(self) -> frozenset[type[Condition]]:
-        """Observations alone: it has no new scans to sample."""
-        return frozenset({Observed})
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
         return self.completion.sample(condition, rngs_of(seeds))

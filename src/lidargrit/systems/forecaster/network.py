@@ -7,6 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lidargrit.generation.pixel_decoder.range_network import bounded_difference
 from lidargrit.nn.blocks import Network, zeroed
 from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.scans.sensors import SensorModel
@@ -19,7 +20,6 @@ _MAPS = 3 + 3 * 5 + 4 + 2 * len(_CYCLES)
 _HEAD_STARTS = (0.0, -1.0, -1.0)  # logits of these components
 _MISSING = -8.0  # of a component without a return
 _LOG_SCALE_M = -3.0  # 5 cm
-_NEAR_V = 0.01  # a difference in v that is half of a large one: a hundredth of the range
 _NEAR_M = 0.02  # a spread that is half of a large one
 _AGE_S = 2.0  # of a map of ages
 
@@ -79,8 +79,7 @@ def maps_of(warped: WarpedPast, past_scans: int, sensor: SensorModel) -> Float[T
     seen, v = surface.range_m > 0, surface.range_m.log1p()
 
     def beside_surface(range_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
-        apart = range_m.log1p() - v
-        return torch.where(seen & (range_m > 0), apart / (apart.abs() + _NEAR_V), 0.0)
+        return torch.where(seen & (range_m > 0), bounded_difference(range_m.log1p() - v), 0.0)
 
     maps = [torch.where(seen, v - TYPICAL_LOG_RANGE, 0.0), surface.returns.to(v).clamp(max=20) / 10]
     maps.append(surface.spread_m / (surface.spread_m + _NEAR_M))

@@ -7,7 +7,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
-from lidargrit.scans.condition import Condition, Observed
+from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -34,17 +34,13 @@ class Interpolation(Generator[InterpolationConfig, SamplingSettings]):
         first_command="complete SCANS completed --observed rows:4 --model RUN",
     )
     capabilities = frozenset({"complete"})
+    has_new_scans = False
     is_random = False
 
     @classmethod
     def smallest_config(cls, sensor: SensorModel) -> InterpolationConfig:
         """Return the settings themselves."""
         return InterpolationConfig()
-
-    @property
-    def takes(self) -> frozenset[type[Condition]]:
-        """Observations alone: it has no new scans to sample."""
-        return frozenset({Observed})
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
         return fill(self.config.method, condition).to(self.device)

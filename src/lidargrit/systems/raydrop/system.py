@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.any_sensor import told_rays_in_place_of_rows
+from lidargrit.generation.any_sensor import RayObjective
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -20,7 +20,7 @@ from lidargrit.generation.semantic_classes import labels_to_learn
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.random import rngs_of
 from lidargrit.scans import marks
-from lidargrit.scans.condition import Condition, ConditionKind, Observed
+from lidargrit.scans.condition import ConditionKind, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.fills import ranges_from_others
 from lidargrit.scans.sensors import SensorModel
@@ -33,7 +33,7 @@ _SETTING = "model.raydrop.reflectance"
 _WITHOUT_LABELS = 0.25  # of the scans, so that a network with classes drops returns of scans without labels, too
 
 
-class RaydropObjective(Objective):
+class RaydropObjective(RayObjective):
     """The likelihood of which surfaces return, in phases and pixel by pixel."""
 
     additions = frozenset({"labels", "reflectance", "any_sensor"})
@@ -43,11 +43,6 @@ class RaydropObjective(Objective):
         super().__init__(sensor)
         self.raydrop = network
         self.needs_marks = network.config.surfaces == "known"
-
-    def weights_from(self, trained: Objective) -> dict[str, Tensor]:
-        """Return the weights of a trained network, for any sensor without those of the rows of a single one."""
-        weights = super().weights_from(trained)
-        return told_rays_in_place_of_rows(weights, self) if self.raydrop.any_sensor else weights
 
     def check(self, images: RangeImage) -> None:
         """Refuse images whose surfaces are not marked, or without the labels or the reflectance to be learned."""
@@ -126,6 +121,7 @@ class Raydrop(Generator[RaydropConfig, SamplingSettings]):
         first_command="raydrop SCANS dropped --model RUN",
     )
     capabilities = frozenset({"complete"})
+    has_new_scans = False
 
     def __init__(self, config: RaydropConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -145,11 +141,6 @@ class Raydrop(Generator[RaydropConfig, SamplingSettings]):
     def objective(self, stage: str) -> Objective:
         """Return the likelihood of which surfaces return."""
         return RaydropObjective(self.raydrop, self.sensor)
-
-    @property
-    def takes(self) -> frozenset[type[Condition]]:
-        """Observations alone: it has no new scans to sample."""
-        return frozenset({Observed})
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
         if not bool((condition.range_observed | condition.return_observed).all()):

@@ -18,7 +18,6 @@ from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, la
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.precision import inference
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
-from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, RangeImage
@@ -185,6 +184,7 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
         first_command="segment SCANS labelled --model RUN",
     )
     is_random = False
+    has_new_scans = False
 
     def __init__(self, config: SegmenterConfig, sensor: SensorModel) -> None:
         super().__init__(config, sensor)
@@ -194,11 +194,6 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
     def smallest_config(cls, sensor: SensorModel) -> SegmenterConfig:
         """Return a network of eight channels and one block."""
         return SegmenterConfig(SegmenterNetworkConfig((8, 8, 8), blocks=1, attention_layers=0, heads=1))
-
-    @property
-    def takes(self) -> frozenset[type[Condition]]:
-        """No condition at all: it has no scans to sample."""
-        return frozenset()
 
     def objective(self, stage: str) -> Objective:
         """Return the errors of the classes."""
