@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, labels_of
+from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, class_iou, labels_of
 from lidargrit.scans.classes import CLASSES, LEARNED, NUMBERINGS, as_semantic_kitti, unknown_numbers
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.simulator import simulate
@@ -37,6 +37,13 @@ def test_networks_learn_the_classes_of_the_benchmark():
     assert NUM_CLASSES == 19
     assert labels_of(class_indices(torch.tensor([0, 1, 40, 252, 9999]))).tolist() == [0, 0, 40, 10, 0]
     assert labels_of(torch.arange(20)).tolist() == [0, *LEARNED]
+
+
+def test_what_is_truly_of_no_class_does_not_count_and_what_is_wrongly_found_to_be_of_none_does():
+    none, first, second, absent = [9, 9, 9, 9], [2, 5, 1, 0], [0, 3, 4, 1], [0, 0, 0, 0]
+    iou = class_iou(torch.tensor([none, first, second, absent]))
+    assert iou[:2].tolist() == pytest.approx([5 / (8 + 3), 4 / (8 + 1)])
+    assert bool(iou[2].isnan())
 
 
 def test_the_simulator_has_no_label_that_is_forgotten():

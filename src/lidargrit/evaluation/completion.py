@@ -17,7 +17,7 @@ from lidargrit.core.table import Table
 from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.metrics import load_metric
-from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices
+from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, class_iou
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.scans.condition import Observed
@@ -261,9 +261,8 @@ def _accuracy(confusion: Int[Tensor, "20 20"]) -> float:
 
 
 def _mean_iou(confusion: Int[Tensor, "20 20"]) -> float:
-    right, true, ours = confusion.diagonal()[1:], confusion[1:].sum(1), confusion[1:, 1:].sum(0)
-    there = true > 0
-    return float((right / (true + ours - right))[there].double().mean())
+    iou = class_iou(confusion).double()
+    return float(iou[~iou.isnan()].mean())
 
 
 def _voxels(points_xyz_m: Float[Tensor, "n 3"]) -> set[tuple[int, int, int]]:

@@ -3,7 +3,7 @@
 from typing import Final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor, nn
 
 from lidargrit.core.errors import ConfigError
@@ -47,6 +47,19 @@ def votes(indices: Int[Tensor, "B S H W"], weights: Float[Tensor, "B S H W"]) ->
     """Return for each class the sum of the weights of the labels that are of this class."""
     size = (len(indices), NUM_CLASSES + 1, *indices.shape[2:])
     return weights.new_zeros(size).scatter_add(1, indices, weights)[:, 1:]
+
+
+def class_iou(counts: Shaped[Tensor, "K K"]) -> Float[Tensor, "C"]:
+    """Return the intersection over union of each class, in [0, 1]; NaN for classes of which there is nothing true.
+
+    Args:
+        counts: number of pixels or points by true class (rows) and found class (columns); the first of each is no
+            class. What is truly of no class does not count; what is wrongly found to be of none does.
+    """
+    counts = counts[1:]
+    right, true, found = counts[:, 1:].diagonal(), counts.sum(1), counts[:, 1:].sum(0)
+    # Not indexed by a mask: the host would wait for the number of classes in it.
+    return torch.where(true > 0, right / (true + found - right), torch.nan)
 
 
 def labels_to_learn(label: Int[Tensor, "B H W"] | None) -> Int[Tensor, "B H W"]:

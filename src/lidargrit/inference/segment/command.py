@@ -1,11 +1,12 @@
 """The verb segment: a source of scans, a segmenter and a folder → the scans with a label for every point."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
 import torch
-from jaxtyping import Float64, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.core import reporting
@@ -17,6 +18,7 @@ from lidargrit.data.run_folder import locate, weights_sha256
 from lidargrit.data.scan_folder import KittiTree, ScanFolder, write_with_labels
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
+from lidargrit.generation.semantic_classes import class_iou
 from lidargrit.inference.segment import can_label, label_images, open_segmenter
 from lidargrit.inference.segment.points import PointLabels
 from lidargrit.scans.classes import CLASS_BITS, CLASSES, Group, as_semantic_kitti
@@ -52,10 +54,8 @@ class LabelScores:
 
     def intersection_over_union(self) -> dict[str, float]:
         """Return the score of each group of which there are true points, in [0, 1]."""
-        counts: Float64[Tensor, "g g"] = self.counts[1:].double()
-        right, true, found = counts[:, 1:].diagonal(), counts.sum(1), counts[:, 1:].sum(0)
-        scores = right / (true + found - right).clamp(min=1)
-        return {group: float(scores[at]) for at, group in enumerate(GROUPS) if true[at] > 0}
+        scores = class_iou(self.counts.double()).tolist()
+        return {group: score for group, score in zip(GROUPS, scores, strict=True) if not math.isnan(score)}
 
     def mean(self) -> float:
         """Return the mean over the groups of which there are true points; NaN without any."""

@@ -14,7 +14,7 @@ from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, required_reflectance
-from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, labels_of, labels_to_learn
+from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, class_iou, labels_of, labels_to_learn
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.precision import inference
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
@@ -141,24 +141,23 @@ class SegmenterObjective(Objective):
         wanted = torch.where(images.return_mask, class_indices(labels_to_learn(images.label)), 0)
         logits = self.segmenter(range_m, reflectance)
         counts = pair_counts(logits.detach(), wanted)
-        of_class = counts.sum(0)
+        of_class = counts[1:].sum(1)
         weight = torch.where(of_class > 0, of_class.clamp(min=1).rsqrt(), 0.0)
         loss = F.cross_entropy(logits, wanted - 1, weight, ignore_index=-1)  # 0, no class, becomes -1
-        right = counts.diagonal()
-        iou = right / (counts.sum(1) + of_class - right).clamp(min=1)
-        mean_iou = iou.where(of_class > 0, 0).sum() / (of_class > 0).sum().clamp(min=1)
-        return {"loss": loss, "accuracy": right.sum() / of_class.sum().clamp(min=1), "mean_iou": mean_iou}
+        accuracy = counts.diagonal()[1:].sum() / of_class.sum().clamp(min=1)
+        mean_iou = class_iou(counts).nan_to_num().sum() / (of_class > 0).sum().clamp(min=1)
+        return {"loss": loss, "accuracy": accuracy, "mean_iou": mean_iou}
 
 
-def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"]) -> Float[Tensor, "19 19"]:
-    """Count the pixels of each found class (rows) and true class (columns), of those whose true class is known.
+def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"]) -> Float[Tensor, "20 20"]:
+    """Count the pixels of each true class (rows) and found class (columns); the first of each is no class.
 
     Args:
         wanted: true class, from 1 to 19; 0 where it is not known.
     """
-    pairs = (logits.argmax(1) * (NUM_CLASSES + 1) + wanted).flatten()
-    counts = logits.new_zeros(NUM_CLASSES * (NUM_CLASSES + 1)).scatter_add(0, pairs, logits.new_ones(len(pairs)))
-    return counts.view(NUM_CLASSES, NUM_CLASSES + 1)[:, 1:]
+    size = NUM_CLASSES + 1
+    pairs = (wanted * size + logits.argmax(1) + 1).flatten()
+    return logits.new_zeros(size**2).scatter_add(0, pairs, logits.new_ones(len(pairs))).view(size, size)
 
 
 def with_likeliest(images: RangeImage, of_class: Float[Tensor, "B 19 H W"]) -> RangeImage:
