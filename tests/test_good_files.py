@@ -11,7 +11,7 @@ from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets.shared.files import is_recognised
 from lidargrit.data.formats import read_scan
 from lidargrit.data.sources import open_source
-from lidargrit.scans.projection import closest_sensor
+from lidargrit.scans.projection.sensor_check import closest_sensor
 from lidargrit.scans.sensors import load_sensor
 from street_corner import corner, pcd_bytes, rows_of, xyz_of
 

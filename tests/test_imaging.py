@@ -14,7 +14,8 @@ from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_source
 from lidargrit.evaluation.pairs import EvalSet, pair_for_protocol
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.scans.projection import doubts_about_rays, inspect, project, projection_that_fits
+from lidargrit.scans.projection import inspect, project, projection_that_fits
+from lidargrit.scans.projection.sensor_check import doubts_about_rays
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 from lidargrit.simulator import simulate

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from lidargrit.cli import main
 from lidargrit.core import discovery
-from lidargrit.scans.projection import closest_sensor, inspect, project, unproject
+from lidargrit.scans.projection import inspect, project, unproject
 from lidargrit.scans.projection.inspection import FATES, as_json, as_table
 from lidargrit.scans.projection.pixel_coordinates import pixel_coordinates
-from lidargrit.scans.projection.sensor_check import sensors_that_fit
+from lidargrit.scans.projection.sensor_check import closest_sensor, sensors_that_fit
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate

@@ -160,8 +160,9 @@ def _score(
     model: Model, pattern: Pattern, whole: RangeImage, condition: Observed, completions: int, seed: int
 ) -> _OfPattern:
     turns = completions if model.generator.is_random else 1
+    seeds = [[scan_seed(seed + turn, index) for index in range(len(whole))] for turn in range(turns)]
     begin = time.perf_counter()
-    filled = [_complete(model, condition, turn, seed) for turn in range(turns)]
+    filled = [model.complete(condition, of_turn) for of_turn in seeds]
     seconds = (time.perf_counter() - begin) / (len(whole) * turns)
     hidden = ~condition.return_observed
 
@@ -193,15 +194,6 @@ def _score(
         reflectance_error=Estimate.of(of_reflectance) if bright else None,
     )
     return _OfPattern(score, errors)
-
-
-def _complete(model: Model, condition: Observed, turn: int, seed: int) -> RangeImage:
-    parts, size = [], model.batch_size
-    for first in range(0, len(condition), size):
-        some = condition[first : first + size]
-        seeds = [scan_seed(seed + turn, index) for index in range(first, first + len(some))]
-        parts.append(model.complete(some, seeds))
-    return RangeImage.cat(parts)
 
 
 def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:

@@ -76,13 +76,8 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
         true: measured range images of the same scans, with true drops.
     """
     _check(generator)
-    dropped = []
-    size = generator.batch_size()
-    for first in range(0, len(clean), size):
-        some = clean[first : first + size]
-        seeds = range(first, first + len(some))
-        dropped.append(generator.complete(Observed.of_surfaces(some), seeds).to("cpu"))
-    return score_curves(RangeImage.cat(dropped), clean, true, RAYDROP_CURVES, scans)
+    dropped = generator.complete(Observed.of_surfaces(clean), range(len(clean))).to("cpu")
+    return score_curves(dropped, clean, true, RAYDROP_CURVES, scans)
 
 
 def raydrop_model(word: str, device: str = "") -> Generator:

@@ -117,7 +117,7 @@ class Observed(Condition):
         return_mask: True where the beam came back.
         return_observed: True where it is known whether the beam came back.
         sensor: sensor whose rays the pixels are.
-        planes: further planes of the observed surfaces or returns, by names of :data:`~lidargrit.scans.types.PLANES`.
+        planes: further planes of the observed surfaces or returns, by names of :data:`~lidargrit.scans.planes.PLANES`.
         earlier_seeds: seeds of the images whose columns lie before those of each image in one scan, the nearest last,
             and -1 for none; None where the images are scans of their own. Drops of neighbouring columns depend on them.
 

@@ -67,11 +67,6 @@ class Past(Condition):
         still = torch.eye(4, dtype=torch.float64).expand(count, scans, 4, 4).clone()
         return cls(images, still, torch.zeros(count, scans, dtype=torch.float64), sensor)
 
-    @property
-    def has_return(self) -> Bool[Tensor, "B"]:
-        """Whether any past scan of each present one returned anywhere."""
-        return (self.range_m > 0).flatten(1).any(1)
-
     def turned(self, fine_columns: Int[Tensor, "B"]) -> "Past":
         """Return the past of images that begin at another fine column, as if the sensor had been mounted turned.
 

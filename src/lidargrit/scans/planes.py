@@ -1,4 +1,4 @@
-"""What a range image may know of every pixel beside its range: the name of a plane → its type and meaning."""
+"""What a range image may know of every pixel beside its range: the name of a plane → its type."""
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -15,24 +15,18 @@ class Plane(NamedTuple):
     """What a plane of a range image holds for every pixel, beside its range.
 
     Args:
-        meaning: name, unit and bounds of the numbers, for messages.
         dtype: type in which images of data have them; those of floating point are always kept in it.
         of_returns: whether only a return has one; it is 0 elsewhere.
     """
 
-    meaning: str
     dtype: type[np.float32 | np.int64]
     of_returns: bool
 
 
 PLANES: Final[Mapping[str, Plane]] = MappingProxyType(
     {
-        "reflectance": Plane("reflectance of the return, in [0, 1]", np.float32, of_returns=True),
-        "label": Plane(
-            "class of what returned by SemanticKITTI's numbers, without its instance; 0 where it is not known",
-            np.int64,
-            of_returns=True,
-        ),
+        "reflectance": Plane(np.float32, of_returns=True),  # in [0, 1]
+        "label": Plane(np.int64, of_returns=True),  # class by SemanticKITTI's numbers, without instance; 0: not known
     }
 )
 """What a range image may know of every pixel beside its range, by name."""

@@ -177,7 +177,7 @@ class RangeImage:
         range_m: Euclidean distance to the return, in metres, kept in 32 bits; 0 where there is none.
         return_mask: whether the beam came back.
         sensor: sensor whose rays the pixels are.
-        planes: further planes of pixels that are known, by names of :data:`PLANES`.
+        planes: further planes of pixels that are known, by names of :data:`~lidargrit.scans.planes.PLANES`.
 
     Raises:
         ScanError: a range that is not finite, not positive on a return, or not 0 elsewhere.

@@ -49,7 +49,7 @@ def plot_comparison(
     Args:
         groups: range images by name ("real", "reconstructed", ...), each one or a batch of 1 to 8; sensors may differ.
         anomaly: bits of every pixel beyond the expected ones, by group, plotted in place of the return mask; see
-            :meth:`lidargrit.scans.types.ScanBits.anomaly`.
+            :meth:`lidargrit.scans.bits.ScanBits.anomaly`.
         filled: True for pixels whose point a model filled in, by group; they have another colour in the return mask and
             in the bird's-eye view.
     """

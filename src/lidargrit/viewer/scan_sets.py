@@ -24,7 +24,6 @@ from lidargrit.scans.types import RangeImage, Scan
 
 _PIXELS_AT_MOST = 200_000  # of a scan on a page: what browsers still turn smoothly
 _BESIDE_AT_MOST = 200_000  # points of a scan on a page that have no pixel: a map of many scans has millions
-_BATCH = 8  # scans computed at once: what a laptop has memory for
 ANOMALOUS_BITS = 12.0  # beyond those expected: what happens to one pixel in some thousands
 _NAME_LETTERS = 40  # of a source's name: what fits above a picture
 
@@ -35,7 +34,7 @@ class ScanSet:
 
     Args:
         name: name of the scans' source, or of what a model made of it.
-        anomaly: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.types.ScanBits.anomaly`; None
+        anomaly: bits of every pixel beyond those expected, see :meth:`lidargrit.scans.bits.ScanBits.anomaly`; None
             if no model was asked.
         filled: True for pixels whose point a model filled in; None where no scan says so.
         beside: points of each scan without a pixel in its image that are shown besides, None for none; empty if the
@@ -123,11 +122,11 @@ def _of_generator(name: str, generator: Generator, seeds: range, scans: ScanSet 
     if scans is not None and "encode" in generator.capabilities:
         images = scans.images
         if generator.sensor.same_rays(images.sensor):
-            reconstructed = _joined(generator.reconstruct(images[part]) for part in _parts(len(images)))
+            reconstructed = generator.reconstruct(images).to("cpu")
             yield ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names)
         else:
             reporting.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
-    generated = _joined(generator.sample(seeds[part]) for part in _parts(len(seeds)))
+    generated = generator.sample(seeds).to("cpu")
     yield ScanSet(f"{_short(name)}: generated", generated, tuple(f"seed {one}" for one in seeds), generated=True)
 
 
@@ -135,14 +134,6 @@ def _fine(sensor: SensorModel) -> SensorModel:
     """Return a sensor with all columns that it fires, or as it is if these are too many pixels for a page."""
     fine = sensor.fine()
     return fine if fine.height * fine.width <= _PIXELS_AT_MOST else sensor
-
-
-def _parts(count: int) -> list[slice]:
-    return [slice(first, first + _BATCH) for first in range(0, count, _BATCH)]
-
-
-def _joined(batches: Iterable[RangeImage]) -> RangeImage:
-    return RangeImage.stack([batch[index].to("cpu") for batch in batches for index in range(len(batch))])
 
 
 def _of_images(source: Source, count: int, sensor: SensorModel | None, config: DataConfig) -> ScanSet:

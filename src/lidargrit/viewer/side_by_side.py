@@ -4,16 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from jaxtyping import Float
-from torch import Tensor
-
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import ScanSettings
-from lidargrit.generation.generator import Generator, load
+from lidargrit.generation.generator import load
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.types import RangeImage
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
 from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
@@ -44,7 +39,7 @@ def view(
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:
-        sets = [replace(scans, anomaly=_anomaly(model, scans.images)) for scans in sets]
+        sets = [replace(scans, anomaly=model.bits(scans.images, expected=True).anomaly().cpu()) for scans in sets]
     for scans in sets:
         _tell_hidden(scans, is_page)
     groups = {scans.name: scans.images for scans in sets}
@@ -67,8 +62,3 @@ def _tell_hidden(scans: ScanSet, is_page: bool) -> None:
         if beside:
             why = f"a page shows {max(beside):,} points beside the pixels of {size}"
         reporting.message(f"{scans.name}: {hidden:,} of {hidden + shown:,} points are hidden, since {why}")
-
-
-def _anomaly(model: Generator, images: RangeImage) -> Float[Tensor, "B H W"]:
-    parts = (images[index : index + 1] for index in range(len(images)))
-    return torch.cat([model.bits(part, expected=True).anomaly().cpu() for part in parts])

@@ -55,11 +55,6 @@ class Ncore(LibraryDataset):
         """Name the drive."""
         return (relative.parent / _drive_of(relative)).as_posix()
 
-    def name(self, index: int) -> str:
-        """Name one scan by its drive and its number there."""
-        path, number = self._scans[index]
-        return f"{self.sequence_of(path.relative_to(self.root))}#{number}"
-
 
 def _drive_of(path: Path) -> str:
     return path.name.partition(_MARK)[0]

@@ -47,11 +47,6 @@ class Py123d(LibraryDataset):
         """Name the log by its split and its own name."""
         return relative.parent.as_posix()
 
-    def name(self, index: int) -> str:
-        """Name one scan by its log and its number there."""
-        path, number = self._scans[index]
-        return f"{self.sequence_of(path.relative_to(self.root))}#{number}"
-
 
 class Py123dLog:
     """The LiDAR on the roof of a log, or its first."""

@@ -3,7 +3,6 @@
 from dataclasses import asdict, dataclass, replace
 
 from lidargrit.core import discovery
-from lidargrit.core.errors import UnknownNameError, one_of
 from lidargrit.core.files import sha256_of_json
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -83,10 +82,7 @@ def load_protocol(name: str) -> Protocol:
         >>> load_protocol("lidargrit-kitti-360").num_scans
         5000
     """
-    name, known = public_name(name), discovery.names("protocols")
-    if name not in known:
-        raise UnknownNameError(f"the protocol {name!r}", f"one of {one_of(sorted(known))}", "choose one")
-    return discovery.load_instance("protocols", name, Protocol)
+    return discovery.load_instance("protocols", public_name(name), Protocol)
 
 
 def public_name(name: str) -> str:

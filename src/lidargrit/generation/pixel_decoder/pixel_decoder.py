@@ -166,7 +166,7 @@ class PixelDecoder(RayNetwork):
     ) -> tuple[Float[Tensor, "B H W"], Float[Tensor, "B H W"], Float[Tensor, "B H W"] | None]:
         """Return the bits of :meth:`forward` for mask and range, and those of :meth:`expected` together if asked for.
 
-        They are what :class:`~lidargrit.scans.types.ScanBits` has of every pixel.
+        They are what :class:`~lidargrit.scans.bits.ScanBits` has of every pixel.
         """
         mask, range_ = (nats / math.log(2) for nats in self(decoded, images, steps))
         if not expected:

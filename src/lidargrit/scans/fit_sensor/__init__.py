@@ -104,7 +104,6 @@ class SensorFit:
         range_step_m: step of which all ranges are multiples, in metres; None if there is none.
         coordinate_step_m: step of which all coordinates are multiples, in metres; None if there is none.
         elevations_deg: elevations (n,) of the points that were used, for a plot.
-        row_of_point: row (n,) of each of these points, -1 for none.
         steps_deg: steps in azimuth (m,) between neighbouring points of a ring, for a plot.
         warnings: sentences that the user should read.
     """
@@ -122,7 +121,6 @@ class SensorFit:
     range_step_m: float | None
     coordinate_step_m: float | None
     elevations_deg: Float64[np.ndarray, "n"]
-    row_of_point: Int64[np.ndarray, "n"]
     steps_deg: Float64[np.ndarray, "m"]
     warnings: tuple[str, ...]
 
@@ -180,7 +178,6 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
         range_step_m=quantum_m(np.concatenate([points.range_m for points in used])),
         coordinate_step_m=quantum_m(np.concatenate([scan.points_xyz_m.double().numpy().ravel() for scan in scans])),
         elevations_deg=np.concatenate([points.elevation_deg for points in used]),
-        row_of_point=np.concatenate(row_of_point),
         steps_deg=steps[:: max(1, len(steps) // _STEPS_KEPT)],
         warnings=(*_notes_of(scans), *doubts),
     )

@@ -2,18 +2,14 @@
 
 from lidargrit.scans.projection.encoding import EncodingName, RangeEncoding
 from lidargrit.scans.projection.image import index_map, points_of_pixels, project, project_by_what_fits, unproject
-from lidargrit.scans.projection.inspection import Inspection, inspect
+from lidargrit.scans.projection.inspection import inspect
 from lidargrit.scans.projection.pixel_coordinates import ProjectionVariant, variant_named
-from lidargrit.scans.projection.sensor_check import FIT_SENSOR, closest_sensor, doubts_about_rays, projection_that_fits
+from lidargrit.scans.projection.sensor_check import projection_that_fits
 
 __all__ = [
     "EncodingName",
-    "FIT_SENSOR",
-    "Inspection",
     "RangeEncoding",
     "ProjectionVariant",
-    "closest_sensor",
-    "doubts_about_rays",
     "index_map",
     "inspect",
     "points_of_pixels",

@@ -41,21 +41,17 @@ class Poses:
     yaw_rad: Float[np.ndarray, " n"]
     slope: Float[np.ndarray, "n 2"]
 
-    def to_world(
-        self, local_m: Float32[np.ndarray, "n *shape 3"], lean: bool = False
-    ) -> Float32[np.ndarray, "n *shape 3"]:
-        """Move things from their own frames into the world; what leans follows the slope of the ground."""
+    def to_world(self, local_m: Float32[np.ndarray, "n *shape 3"]) -> Float32[np.ndarray, "n *shape 3"]:
+        """Move things from their own frames into the world."""
         spread = (slice(None),) + (None,) * (local_m.ndim - 2)
         cos, sin = (f(self.yaw_rad).astype(np.float32)[spread] for f in (np.cos, np.sin))
-        foot, slope = self.xyz_m.astype(np.float32), self.slope.astype(np.float32)
+        foot = self.xyz_m.astype(np.float32)
         out = np.empty_like(local_m)
         x = cos * local_m[..., 0] - sin * local_m[..., 1]
         y = sin * local_m[..., 0] + cos * local_m[..., 1]
         np.add(x, foot[:, 0][spread], out=out[..., 0])
         np.add(y, foot[:, 1][spread], out=out[..., 1])
         np.add(local_m[..., 2], foot[:, 2][spread], out=out[..., 2])
-        if lean:
-            out[..., 2] += slope[:, 0][spread] * x + slope[:, 1][spread] * y
         return out
 
     def of(self, which: Shaped[np.ndarray, " m"]) -> "Poses":

@@ -60,6 +60,11 @@ class LibraryDataset(FileDataset):
         cure = "copy it anew, or leave it out"
         return DataError(f"{path}, which {cls.library} cannot read ({what})", cls.tree, cure)
 
+    def name(self, index: int) -> str:
+        """Name one scan by its drive and its number there."""
+        path, number = self._scans[index]
+        return f"{self.sequence_of(path.relative_to(self.root))}#{number}"
+
     @classmethod
     def scans_in(cls, path: Path, topic: str = "") -> int:
         """Count the scans of a drive's first LiDAR."""

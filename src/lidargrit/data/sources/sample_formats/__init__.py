@@ -16,7 +16,7 @@ from torch import Tensor
 from lidargrit.core import discovery
 from lidargrit.core.arrays import mapped_member
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import DataError, ScanError, UnknownNameError, nearest_names
+from lidargrit.core.errors import DataError, ScanError
 from lidargrit.data import formats
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -88,11 +88,8 @@ class SampleFormat:
 
 
 def load_sample_format(name: str) -> SampleFormat:
-    """Return a sample_format by its name, or raise UnknownNameError."""
-    name, known = name.replace("-", "_"), discovery.names("sample-formats")
-    if name not in known:
-        raise UnknownNameError(f"samples of {name!r}", f"those of {nearest_names(name, known, 9)}", "choose one")
-    return discovery.load_instance("sample-formats", name, SampleFormat)
+    """Return a format of samples by its name, or raise UnknownNameError."""
+    return discovery.load_instance("sample-formats", name.replace("-", "_"), SampleFormat)
 
 
 def is_tensor_folder(folder: Path) -> bool:
