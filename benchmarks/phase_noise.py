@@ -16,8 +16,8 @@ from lidargrit.core.files import read_tensors
 from lidargrit.data.run_folder import RUN_FILE, WEIGHTS_FILE, locate, trained_on_file
 from lidargrit.data.sources import open_images
 from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
 from lidargrit.generation.pixel_decoder.phase_noise import PhaseNoise
-from lidargrit.generation.pixel_decoder.pixel_networks import MaskNetwork
 from lidargrit.scans.example import Example
 
 _AT_ONCE = 4

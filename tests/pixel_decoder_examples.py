@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.scans.sensors import SensorModel, SensorSetup
 from lidargrit.scans.types import Decoded, RangeImage
 

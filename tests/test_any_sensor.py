@@ -13,9 +13,9 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.batches import Batches
 from lidargrit.data.images import Pixels, RangeImages
 from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, phases_of
 from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds, row_features, with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps

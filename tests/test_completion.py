@@ -21,7 +21,7 @@ from lidargrit.data.sources import open_images, open_source
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES, decoded_surfaces, score_raydrop
 from lidargrit.evaluation.realism import tables
 from lidargrit.generation.generator import load, load_class
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.inference.complete import open_model, open_models
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
 from lidargrit.inference.samples import write_samples

@@ -12,7 +12,7 @@ from lidargrit.core.errors import OutputError
 from lidargrit.core.files import write_text
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.inference.complete.clouds_to_files import suffix_of
 from lidargrit.inference.complete.inputs import ScanReader, open_inputs
 from lidargrit.inference.complete.sparse import SparseReader

@@ -13,8 +13,8 @@ from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, ScanError
 from lidargrit.data.sources import open_source
 from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.inference.compress import rounding

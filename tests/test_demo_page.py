@@ -15,7 +15,7 @@ from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.run_folder import RUN_FILE
 from lidargrit.evaluation.intervals import RealAgainstReal
 from lidargrit.evaluation.reconstruction import score_reconstruction
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.systems.lidargrit.system import LidarGrit
 from lidargrit.viewer import demo
 from lidargrit.viewer.demo_page import DemoPage, nearest_scans, write_demo_page

@@ -22,7 +22,7 @@ from lidargrit.cli import build_parser
 from lidargrit.core import discovery
 from lidargrit.core.errors import UsageError
 from lidargrit.generation.generator import load_class
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.systems.lidargrit.system import LidarGrit
 

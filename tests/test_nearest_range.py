@@ -11,8 +11,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import at_phases
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.settings import Preset, TrainingConfig

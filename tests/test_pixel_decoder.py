@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder.phase_network import Guide, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
-from lidargrit.generation.pixel_decoder.pixel_networks import Guide, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     at_phases,
     completed_lattices,

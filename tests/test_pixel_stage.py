@@ -20,7 +20,7 @@ from lidargrit.evaluation.likelihood import _maps
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.batches import in_batches
 from lidargrit.generation.generator import load
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig

@@ -11,7 +11,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.pixel_decoder import pixel_decoder
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
 from lidargrit.nn.decoding import CachedDecoder

@@ -8,7 +8,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.formats.kitti_bin import KittiBin
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae, VqvaeConfig
 from lidargrit.nn.transformer import TransformerConfig
 from lidargrit.scans.condition import Observed

@@ -16,8 +16,8 @@ from lidargrit.generation.encoding_cache import EncodingCache, Frozen
 from lidargrit.generation.facts import Cost, SamplingSettings
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig

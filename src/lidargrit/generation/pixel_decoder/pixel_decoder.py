@@ -14,7 +14,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Temperature, Weight
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.facts import SamplingSettings
-from lidargrit.generation.pixel_decoder.pixel_networks import Guide, MaskNetwork, PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
+from lidargrit.generation.pixel_decoder.phase_network import Guide, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,

@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lidargrit.generation.pixel_decoder.pixel_networks import Guide, PhaseNetwork, PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import Guide, PhaseNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,

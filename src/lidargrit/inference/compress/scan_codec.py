@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.generator import Generator
+from lidargrit.generation.pixel_decoder.phase_network import Guide
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder
-from lidargrit.generation.pixel_decoder.pixel_networks import Guide
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.generation.tokens import TokenGenerator

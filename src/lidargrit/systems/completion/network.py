@@ -11,7 +11,8 @@ from torch import Tensor
 
 from lidargrit.core.typed_values import Count, NotNegative
 from lidargrit.generation.any_sensor import RayNetwork
-from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
+from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
+from lidargrit.generation.pixel_decoder.phase_network import LOGIT_BOUND, Guide
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import NUM_CLASSES, ClassMaps, class_indices, labels_of, votes
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from lidargrit.generation import presets as shared
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.presets import preset, variant
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.nearest_range import NearestRangeConfig

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from lidargrit.generation.pixel_decoder.pixel_networks import PixelDecoderConfig
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.presets import ANY_SENSOR, MORE_STREETS, PIXEL_DECODER, PIXELS, WIDE_STREETS, preset
 from lidargrit.systems.multiscale.system import MultiscaleConfig
 

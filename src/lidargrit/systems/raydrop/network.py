@@ -13,7 +13,8 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count
 from lidargrit.generation.any_sensor import RayNetwork
-from lidargrit.generation.pixel_decoder.pixel_networks import LOGIT_BOUND, Guide, MaskNetwork
+from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
+from lidargrit.generation.pixel_decoder.phase_network import LOGIT_BOUND, Guide
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE
 from lidargrit.generation.semantic_classes import ClassMaps, class_indices
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size

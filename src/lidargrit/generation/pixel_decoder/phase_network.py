@@ -1,35 +1,28 @@
-"""The two networks of a pixel decoder: pixels so far → mask and range of the next phase's pixels."""
+"""What the mask's and the range's network of a pixel decoder share: sizes, what guides them, a network a lattice."""
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Share
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
-from lidargrit.generation.any_sensor import RayNetwork
-from lidargrit.generation.pixel_decoder.lattice_network import LatticeNetwork
-from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise, following
 from lidargrit.generation.pixel_decoder.pixel_phases import (
     Lattice,
     Phase,
-    at_phases,
     cells_of,
     generated_before,
-    one_of_phases,
     phases_of,
 )
 from lidargrit.generation.pixel_decoder.ray_encoding import LEAST_CELL, RowEncoding, coarsest_cell_of
+from lidargrit.nn.blocks import Network
+from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.precision import at_least_32_bits
-from lidargrit.nn.random import of_host, rngs_of
-from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import TYPICAL_LOG_RANGE, Decoded
 
@@ -37,7 +30,6 @@ LOGIT_BOUND = 8.0  # of the decoder's return logits, beyond which it is as good 
 _HALVINGS_AT_MOST = 8  # of one side alone
 _COARSE_AREA = 64  # lattices with one in so many pixels, or fewer, are coarse
 _DECODED_LOG_SCALE_M = -3.0  # 5 cm
-_NEVER = -60.0  # logit of a return in rows that a sensor does not have
 
 
 @dataclass(frozen=True)
@@ -168,6 +160,34 @@ class Guide(NamedTuple):
         return cls(like.new_zeros(count, 0, *size[1:]), like.new_full(size, TYPICAL_LOG_RANGE), like.new_zeros(size))
 
 
+class LatticeNetwork(Network):
+    """The network of all phases of one lattice, over cells of 2x2 pixels of the lattice.
+
+    The part of the first layer that sees the guide is computed once for all phases.
+    """
+
+    def __init__(self, guide: int, context: int, width: int, blocks: int, phases: int, outputs: int) -> None:
+        super().__init__()
+        self.guide, self.context = Convolution(guide, width, "wrap"), Convolution(context, width, "wrap")
+        self.phase_bias = nn.Parameter(torch.zeros(phases, width))
+        self.blocks = nn.Sequential(*(Residual(width) for _ in range(blocks)))
+        self.out = nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases))
+        for layer in self.out:
+            nn.init.zeros_(layer.get_parameter("weight"))
+            nn.init.zeros_(layer.get_parameter("bias"))
+
+    def forward(
+        self, guided: Float[Tensor, "B C h w"], contexts: Float[Tensor, "P B D h w"], first: int
+    ) -> Float[Tensor, "P B O h w"]:
+        """Return the outputs of as many phases as there are contexts, from the phase ``first`` on."""
+        size = contexts.shape[:2]
+        x = self.context(contexts.flatten(0, 1)).unflatten(0, size)
+        x = x + guided + self.phase_bias[first : first + size[0], None, :, None, None]
+        x = F.silu(self.blocks(x.flatten(0, 1))).unflatten(0, size)
+        outputs = [layer(part) for layer, part in zip(self.out[first:], x, strict=False)]
+        return at_least_32_bits(torch.stack(outputs))
+
+
 class PhaseNetwork(nn.Module):
     """Base of the mask's and the range's network: a small network for each lattice, run anew for every phase.
 
@@ -262,139 +282,3 @@ class PhaseNetwork(nn.Module):
 def _by_lattice(phases: list[Phase]) -> list[list[Phase]]:
     lattices = dict.fromkeys(phase.lattice for phase in phases)
     return [[phase for phase in phases if phase.lattice == lattice] for lattice in lattices]
-
-
-class MaskNetwork(PhaseNetwork):
-    """The logits of P(return), given which of the earlier pixels returned: a correction of the decoder's logits."""
-
-    context_channels = 4 * 2
-
-    def __init__(
-        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, num_rows: int | None = None
-    ) -> None:
-        widths = config.mask_width, config.mask_width
-        super().__init__(config, sensor, features, config.mask_features, widths, 1, num_rows)
-        self.row_bias = (
-            nn.Linear(config.row_channels, 1) if config.any_sensor else nn.Parameter(torch.zeros(sensor.height))
-        )
-        places = None
-        if config.any_sensor:
-            rows = (sensor.elevation_rad.double().mean(1) / -ROW_RAD).tolist()
-            places = rows, 2 * math.pi / sensor.width / COLUMN_RAD
-        self.noise = PhaseNoise(self._learned, places)
-
-    @classmethod
-    def behind(cls, features: int, width: int, network: RayNetwork) -> "MaskNetwork":
-        """Return a network that samples masks behind another network than a tokenizer's decoder, all of whose features
-        it sees.
-
-        Args:
-            features: channels of the other network's features.
-            width: channels of the layers.
-            network: the other network, which tells the sensor, and whether it is any.
-        """
-        config = PixelDecoderConfig(mask_features=features, mask_width=width, any_sensor=network.any_sensor)
-        return cls(config, network.grid, features, network.sensor.height)
-
-    def context(
-        self, phases: list[Phase], guide: Guide, return_mask: Bool[Tensor, "B H W"]
-    ) -> Float[Tensor, "P B D h w"]:
-        """Return for each pixel of a cell whether it is known to have returned, and whether it is known not to.
-
-        Later pixels have no influence.
-        """
-        lattice = phases[0].lattice
-        returned = cells_of(return_mask[:, None].to(guide.v.dtype), lattice)
-        certain = self.generated_before(phases)
-        if guide.observed is not None:
-            certain = torch.maximum(certain, cells_of(guide.observed[:, None].to(guide.v.dtype), lattice))
-        return torch.cat((certain * returned, certain * (1 - returned)), 2)
-
-    def uniform(
-        self, rngs: Sequence[torch.Generator], earlier_seeds: Int64[Tensor, "B K"] | None = None
-    ) -> Float[Tensor, "B H W"]:
-        """Return random numbers for one mask of each generator, correlated as learned, on the device of the network.
-
-        Args:
-            earlier_seeds: seeds of images whose columns lie before those of each image, the nearest last, and -1 for
-                none; their numbers then correlate with its own.
-        """
-        shares = self.noise.shares()
-
-        def of(rng: torch.Generator) -> Float[Tensor, "H W"]:
-            return self.noise(torch.rand((self.sensor.height, self.sensor.width), generator=rng), rng, shares)
-
-        numbers = [of(rng) for rng in rngs]
-        every = (
-            [] if earlier_seeds is None else [[one for one in seeds if one >= 0] for seeds in earlier_seeds.tolist()]
-        )
-        seeds = sorted({one for some in every for one in some})
-        drawn = {
-            seed: of(rng) for seed, rng in zip(seeds, rngs_of(seeds), strict=True)
-        }  # images of one scan share them
-        for at, some in enumerate(every):
-            numbers[at] = following(numbers[at], [drawn[seed] for seed in some])
-        return torch.stack(numbers).to(self.before.device)
-
-    def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:
-        """Return the mask, sampled phase by phase around its observed pixels.
-
-        Args:
-            guide: output of the decoder for every pixel.
-            uniform: random numbers in [0, 1): independent ones, or those that ``noise`` makes of them.
-        """
-        guided = self.guided(guide)
-        mask = condition.return_mask & condition.return_observed
-        for phase in self.phases:
-            pixels = (..., *phase.pixels)
-            sampled = uniform[pixels] < self.logits([phase], guided, guide, mask)[0].sigmoid()
-            mask[pixels] = torch.where(condition.return_observed[pixels], mask[pixels], sampled)
-        return mask
-
-    def logits(
-        self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, return_mask: Bool[Tensor, "B H W"]
-    ) -> Float[Tensor, "P B h w"]:
-        """Return the logits of the pixels of phases of one lattice; later pixels of the mask have no influence."""
-        output = self.outputs(phases, guided, self.context(phases, guide, return_mask))
-        decoded = guide.return_logits + self.row_biases(phases[0].lattice)[:, None]
-        return output[:, :, 0] + at_phases(decoded, phases)
-
-    def row_biases(self, lattice: Lattice) -> Float[Tensor, "H"]:
-        """Return what is added to the logits of all rows; absent ones never return."""
-        if not isinstance(self.row_bias, nn.Linear):
-            return self.row_bias
-        own = self.row_bias(self.row_values(lattice).T)[: self.num_rows, 0]
-        return F.pad(own, (0, self.sensor.height - self.num_rows), value=_NEVER)
-
-    def phase_nll(
-        self, phases: list[Phase], guided: dict[Lattice, Tensor], guide: Guide, returned: Bool[Tensor, "B H W"]
-    ) -> Float[Tensor, "P B h w"]:
-        """Return the negative log-likelihood in nats of the pixels of phases of one lattice, 0 for observed ones.
-
-        In training the noise learns from them how pixels of one phase depend on one another.
-        """
-        logits = self.logits(phases, guided, guide, returned)
-        truth = at_phases(returned, phases)
-        nll = F.binary_cross_entropy_with_logits(logits, truth.float(), reduction="none")
-        known = None if guide.observed is None else at_phases(guide.observed, phases)
-        if self.training:
-            self.noise.learn(phases, logits if known is None else logits.masked_fill(known, torch.inf), truth)
-        return nll if known is None else nll * ~known
-
-    def nats(
-        self, guide: Guide, returned: Bool[Tensor, "B H W"], rng: torch.Generator | None = None
-    ) -> Float[Tensor, " B"]:
-        """Return the negative log-likelihood of the unknown part of each mask in nats.
-
-        Args:
-            guide: output of a decoder for every pixel, and what is known before the first phase.
-            returned: true masks.
-            rng: chooses one phase of each lattice, which stands for all; every phase is counted without it.
-        """
-        guided, total = self.guided(guide), guide.v.new_zeros(len(returned))
-        rng = None if rng is None else of_host(rng)
-        for phases in self.by_lattice():
-            chosen = phases if rng is None else one_of_phases(phases, rng)
-            nll = self.phase_nll(chosen, guided, guide, returned)
-            total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
-        return total
