@@ -1,6 +1,5 @@
 """A condition that scans tell, from the preset to the page: a toy whose scans have a class."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -9,14 +8,11 @@ import torch
 import toy_of_class
 from lidargrit.cli import main
 from lidargrit.core import discovery
-from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
+from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources.samples import read_condition, read_samples
 from lidargrit.generation.generator import load, load_class
 from lidargrit.generation.settings import Preset, TrainingConfig
-from lidargrit.inference.samples import write_samples
 from lidargrit.scans.condition import Observed
-from lidargrit.scans.types import RangeImage
 from lidargrit.training import train
 from lidargrit.training.plan import check_stages, plan_training
 from lidargrit.training.stage import StageTraining
@@ -24,7 +20,6 @@ from lidargrit.viewer.serve.requests import SampleRequest
 from lidargrit.viewer.serve.worker import compute_result, describe_model
 from toy_of_class import OfClass, ToyConfig
 
-OF_OBSERVED = ("range_m", "range_observed", "return_mask", "return_observed")
 FIT = TrainingConfig(8 * 6, 4, 0.1, validate_every=8, validation_scans=2, checkpoint_every=8, average_over_scans=0)
 
 
@@ -59,7 +54,9 @@ def test_a_class_of_scans_is_learned_resumed_sampled_scored_and_served(tmp_path,
     weights = [dict(one.named_parameters())["means"] for one in (model, load(tmp_path / "unbroken"))]
     assert torch.equal(*weights)
     assert len(weights[0].unique()) == 3
-    scans = model.sample([5, 5, 6], OfClass(torch.tensor([0, 1, 1])))
+    told = OfClass(torch.tensor([0, 1, 1]))
+    scans = model.sample([5, 5, 6], told)
+    assert torch.equal(torch.stack([one.range_m for one in model.stream([5, 5, 6], condition=told)]), scans.range_m)
     assert not torch.equal(scans.range_m[0], scans.range_m[1])
     assert torch.equal(model.sample([6], OfClass(torch.tensor([1]))).range_m[0], scans.range_m[2])
     assert main(["sample", str(run), str(tmp_path / "samples"), "-n", "3"]) == 0
@@ -69,42 +66,6 @@ def test_a_class_of_scans_is_learned_resumed_sampled_scored_and_served(tmp_path,
     assert describe_model("toy", model)["tasks"] == []
     (made,) = compute_result(model, SampleRequest(0, 5, 1, {}))
     assert torch.equal(made.images.range_m, model.sample([5]).range_m)
-
-
-def test_samples_keep_their_condition_and_can_be_made_again(tmp_path):
-    model, run, folder = preset().build_generator(), tmp_path / "run", tmp_path / "samples"
-    with torch.no_grad():
-        dict(model.named_parameters())["means"].copy_(torch.tensor([1.0, 2.0, 3.0]))
-    model.save(run)
-    told = OfClass(torch.tensor([0, 1, 1, 0]))
-    write_samples(model, run, folder, [3, 4], condition=told[:2])
-    write_samples(model, run, folder, [3, 4, 5, 6], condition=told)  # goes on
-    assert json.loads((folder / "samples.json").read_text())["condition"] == "OfClass"
-    kept = read_condition(folder, [3, 4, 5, 6], OfClass)
-    assert torch.equal(kept.number, told.number)
-    assert torch.equal(model.sample([3, 4, 5, 6], kept).range_m, read_samples(folder).batch([0, 1, 2, 3]).range_m)
-    with pytest.raises(OutputError, match=r"00000003\.npz, a sample under another condition"):
-        write_samples(model, run, folder, [3], condition=OfClass(torch.tensor([1])))
-    with pytest.raises(OutputError, match="holds samples of another model or sampled in another way"):
-        write_samples(model, run, folder, [3])
-    with pytest.raises(ScanError, match="wanted a sample under a condition Observed"):
-        read_condition(folder, [3], Observed)
-
-
-def test_a_completion_keeps_what_was_observed_of_it(tmp_path):
-    cls = load_class("lidarvae")
-    sensor = preset().build_generator().sensor.with_columns(32)
-    model = cls(cls.smallest_config(sensor), sensor).eval()
-    model.save(tmp_path / "run")
-    range_m = 10 + torch.rand(2, sensor.height, sensor.width)
-    seen = RangeImage(range_m, torch.ones_like(range_m, dtype=torch.bool), sensor, {"reflectance": range_m / 100})
-    observed = Observed.of_pixels(seen, (torch.arange(sensor.height) % 2 == 0)[None, :, None].expand_as(range_m))
-    write_samples(model, tmp_path / "run", tmp_path / "out", [7, 8], condition=observed)
-    kept = read_condition(tmp_path / "out", [7, 8], Observed)
-    assert kept.tensors().keys() == observed.tensors().keys() == {*OF_OBSERVED, "planes.reflectance"}
-    assert all(torch.equal(known, kept.tensors()[name]) for name, known in observed.tensors().items())
-    again = model.sample([7, 8], kept, model.completion_sampling())
-    assert torch.equal(again.range_m, read_samples(tmp_path / "out").batch([0, 1]).range_m)
 
 
 def test_conditions_that_do_not_fit_are_refused():

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from lidargrit.core import configuration, reporting
-from lidargrit.core.errors import OutputError
 from lidargrit.core.files import (
     atomic_path,
     claim_folder,
@@ -27,10 +26,9 @@ from lidargrit.core.files import (
 from lidargrit.core.shares import each_done
 from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, trained_on_file, weights_sha256
 from lidargrit.data.scan_folder import begun_by
-from lidargrit.data.sources.samples import CONDITION, MANIFEST, is_sample_folder, read_condition
+from lidargrit.data.sources.samples import MANIFEST, is_sample_folder
 from lidargrit.generation.generator import Generator, SamplingT, load
 from lidargrit.nn.devices import usable_device
-from lidargrit.scans.condition import NOTHING, Condition, Observed
 from lidargrit.scans.types import RangeImage
 
 _SHARE_ON_RAY = 32  # seeds: two batches, seconds of work
@@ -42,7 +40,6 @@ def write_samples(
     folder: Path,
     seeds: Sequence[int],
     sampling: SamplingT | None = None,
-    condition: Condition = NOTHING,
 ) -> None:
     """Write one file for each seed, at bounded memory; seeds that are there already are not sampled again.
 
@@ -51,19 +48,14 @@ def write_samples(
         folder: output folder for ``samples.json`` and ``SEED.npz`` with ``range_m`` (H, W) in metres, 0 for no return,
             and ``reflectance`` in [0, 1] if the generator writes it.
         seeds: one seed for each scan; other processes may write other seeds into the same folder meanwhile.
-        condition: condition of each scan, as many as seeds; each file keeps that of its scan, which
-            :func:`lidargrit.data.sources.samples.read_condition` reads, so that the scan can be made again.
     """
-    default = generator.completion_sampling if isinstance(condition, Observed) else generator.Sampling
-    settings = default() if sampling is None else sampling
+    settings = generator.Sampling() if sampling is None else sampling
     manifest: dict[str, Any] = {
         **sampling_identity(generator, run_folder, settings),
         "generator": generator.public_name(),
         "cost_per_scan": asdict(generator.cost(settings)),
         "sensor": generator.sensor.to_json(),
     }
-    if condition != NOTHING:
-        manifest["condition"] = type(condition).__name__
     if variant := recorded_projection(run_folder):
         manifest["projection_variant"] = variant
     if generator.full_rows is not None:
@@ -71,11 +63,7 @@ def write_samples(
     trained_on = _trained_on(run_folder)
     begun = _is_begun(folder, manifest)
     missing = _missing(folder, seeds)
-    where = {seed: at for at, seed in enumerate(seeds)}
-    if condition != NOTHING and begun:
-        _refuse_other_condition(folder, condition, {seed: where[seed] for seed in where.keys() - {*missing}})
-    known = condition[[where[seed] for seed in missing]]
-    images = generator.stream(missing, settings, known)
+    images = generator.stream(missing, settings)
     with (
         claim_folder(folder, shared=True) if missing else nullcontext(),
         reporting.progress("sampling", len(seeds), len(seeds) - len(missing)) as progress,
@@ -85,10 +73,10 @@ def write_samples(
             _begin(folder, manifest)
         if trained_on is not None and not (folder / TRAINED_ON_FILE).exists() and is_sample_folder(folder):
             write_text(folder / TRAINED_ON_FILE, trained_on)
-        for at, (seed, image) in enumerate(zip(missing, chain(first, images), strict=True)):
+        for seed, image in zip(missing, chain(first, images), strict=True):
             if not is_sample_folder(folder):  # or the write would make the folder anew, without the earlier samples
                 raise removed_meanwhile(folder)
-            _write_image(_file(folder, seed), image, known[[at]])
+            _write_image(_file(folder, seed), image)
             progress.advance(1)
     if seeds and (not is_sample_folder(folder) or _missing(folder, seeds)):
         raise removed_meanwhile(folder)
@@ -122,19 +110,6 @@ def _write_some(run_folder: Path, folder: Path, words: Sequence[str], device: st
 @lru_cache(maxsize=1)  # for all shares of a worker
 def _generator_of(run_folder: Path, device: str) -> Generator[Any, Any]:
     return load(run_folder).to(usable_device(device))
-
-
-def _refuse_other_condition(folder: Path, condition: Condition, there: dict[int, int]) -> None:
-    """Refuse a folder that holds the scan of a seed under another condition than this command's.
-
-    Args:
-        there: index in the condition of each seed whose sample is there.
-    """
-    for seed, at in there.items():
-        ours, theirs = condition[[at]].tensors(), read_condition(folder, [seed], type(condition)).tensors()
-        if ours.keys() != theirs.keys() or any(not torch.equal(ours[name].cpu(), theirs[name]) for name in ours):
-            got = f"{_file(folder, seed)}, a sample under another condition"
-            raise OutputError(got, "that of this very command", "choose another folder")
 
 
 def sampling_identity(generator: Generator[Any, Any], run_folder: Path, sampling: object) -> dict[str, Any]:
@@ -174,11 +149,10 @@ def _same(there: dict[str, Any], manifest: dict[str, Any]) -> bool:
     return {**there, "cost_per_scan": None} == {**manifest, "cost_per_scan": None}
 
 
-def _write_image(path: Path, image: RangeImage, condition: Condition) -> None:
+def _write_image(path: Path, image: RangeImage) -> None:
     pixels: dict[str, Any] = {"range_m": image.range_m.cpu().numpy()}
     if image.reflectance is not None:
         pixels["reflectance"] = image.reflectance.cpu().numpy()
-    pixels |= {f"{CONDITION}{name}": known[0].cpu().numpy() for name, known in condition.tensors().items()}
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **pixels)
 

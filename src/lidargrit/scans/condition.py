@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields
+from itertools import chain
 from typing import Any, Literal, Self
 
 import torch
@@ -33,7 +34,9 @@ class Condition:
 
     def __len__(self) -> int:
         """Return the number of scans; 0 for any."""
-        return max(map(len, self.tensors().values()), default=0)
+        values = (getattr(self, each.name) for each in fields(self))
+        known = chain.from_iterable(each.values() if isinstance(each, Mapping) else (each,) for each in values)
+        return max((len(each) for each in known if isinstance(each, Tensor)), default=0)
 
     def __getitem__(self, index: slice | list[int]) -> Self:
         """Return what is known of some of the scans."""
@@ -42,32 +45,6 @@ class Condition:
     def to(self, device: torch.device | str) -> Self:
         """Return it with its tensors on another device."""
         return self._mapped(lambda known: known.to(device))
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return its tensors by the names of their fields; those of a mapping by both names with a dot between."""
-        found: dict[str, Tensor] = {}
-        for name, value in ((each.name, getattr(self, each.name)) for each in fields(self)):
-            if isinstance(value, Mapping):
-                found |= {f"{name}.{key}": known for key, known in value.items()}
-            elif isinstance(value, Tensor):
-                found[name] = value
-        return found
-
-    @classmethod
-    def of_tensors(cls, tensors: Mapping[str, Tensor], sensor: SensorModel) -> Self:
-        """Return the condition whose :meth:`tensors` these are, of scans of a sensor."""
-        given: dict[str, Any] = {}
-        for each in fields(cls):
-            below = {
-                name.removeprefix(f"{each.name}."): known
-                for name, known in tensors.items()
-                if name.startswith(f"{each.name}.")
-            }
-            if each.name == "sensor":
-                given["sensor"] = sensor
-            elif each.name in tensors or below:
-                given[each.name] = below or tensors[each.name]
-        return cls(**given)
 
     @classmethod
     def cat(cls, parts: Sequence[Self]) -> Self:

@@ -1,28 +1,20 @@
 """A folder of generated scans, one a file → their range images, and what it says of their model."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, read_arrays, read_member
+from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, read_arrays
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import CheckpointError, ConfigError, DataError, ScanError
 from lidargrit.core.files import read_json, sha256_of_json
 from lidargrit.data.formats import open_file
 from lidargrit.data.images import Pixels, Provenance, RangeImages
-from lidargrit.scans.condition import Condition
 from lidargrit.scans.sensors import SensorModel
 
 MANIFEST = "samples.json"
-CONDITION = "condition."
-"""How arrays of a sample's file begin that hold what the generator was told of it."""
-
-ConditionT = TypeVar("ConditionT", bound=Condition)
 
 
 class SampleFacts(NamedTuple):
@@ -81,31 +73,6 @@ def read_samples(folder: Path, count: int | None = None) -> RangeImages:
             f"no sample in {folder}", "at least one", "generate some with: lidargrit sample RUN " + str(folder)
         )
     return RangeImages(facts.sensor, [_Files(paths, facts.sensor, facts.model_and_sampling)])
-
-
-def read_condition(folder: Path, seeds: Sequence[int], kind: type[ConditionT]) -> ConditionT:
-    """Return the condition under which some scans of a folder were sampled.
-
-    Args:
-        seeds: seeds of the scans, which have all been sampled.
-        kind: type of the condition, which ``samples.json`` names.
-    """
-    known: dict[str, list[Tensor]] = {}
-    wanted = f"a sample under a condition {kind.__name__}"
-    for path in (folder / f"{seed:08d}.npz" for seed in seeds):
-        try:
-            with open_file(path, wanted) as file, open_archive(file) as archive:
-                members = [info for info in archive.infolist() if info.filename.startswith(CONDITION)]
-                arrays = {info.filename.removesuffix(".npy"): read_member(archive, info) for info in members}
-        except ValueError as error:
-            raise ScanError(f"{path}, which cannot be read ({error})", wanted, "sample it again") from None
-        for name, array in arrays.items():
-            known.setdefault(name.removeprefix(CONDITION), []).append(torch.from_numpy(array.copy()))
-    try:
-        stacked = {name: torch.stack(parts) for name, parts in known.items()}
-        return kind.of_tensors(stacked, read_facts(folder).sensor)
-    except (TypeError, RuntimeError) as error:
-        raise ScanError(f"samples of {folder} under another condition ({error})", wanted, "name others") from None
 
 
 def is_sample_folder(folder: Path) -> bool:
