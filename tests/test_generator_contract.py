@@ -27,7 +27,6 @@ HOOKS = {  # what a generator with a capability overrides
     "tokens": "get_tokenizer",
     "encode": "_reconstruct",
     "complete": "_complete",
-    "invert": "_invert",
     "likelihood": "_bits",
 }
 
@@ -105,7 +104,6 @@ def calls(images, condition, seeds, sampling):
         "tokens": ("get_tokenizer",),
         "encode": ("reconstruct", images),
         "complete": ("complete", condition, seeds, sampling),
-        "invert": ("invert", images, seeds, sampling),
         "likelihood": ("bits", images),
     }
 
@@ -232,7 +230,7 @@ def test_images_and_masks_of_others_are_refused(name):
         if capability != "complete":
             with pytest.raises(ConfigError, match=r"^got range images of shape \(64, 32\); wanted a batch"):
                 call(generator, calls(images[0], None, seeds, sampling)[capability])
-        if capability in ("complete", "invert"):
+        if capability == "complete":
             with pytest.raises(ConfigError, match=r"^got 3 seeds for 2 images; wanted one seed for each image"):
                 call(generator, calls(images, condition, [0, 1, 2], sampling)[capability])
             with pytest.raises(ConfigError, match=r"^got the seed -2; "):
@@ -336,11 +334,10 @@ def test_what_it_can_do_besides_keeps_to_the_seeds_and_the_sensor(name):
         assert float(bits.per_pixel().double().sum()) == pytest.approx(float(bits.total().sum()), rel=1e-5)
         with pytest.raises(ConfigError, match="got a step of 0 mm; wanted a whole number of millimetres"):
             generator.bits(images, step_mm=0)
-    for capability, given in (("complete", known_of(generator, images)), ("invert", images)):
-        if capability in generator.capabilities:
-            method = getattr(generator, capability)
-            found = method(given, [3, 4], sampling)
-            assert same(found[1:2], method(given[1:], [4], sampling))
+    if "complete" in generator.capabilities:
+        known = known_of(generator, images)
+        found = generator.complete(known, [3, 4], sampling)
+        assert same(found[1:2], generator.complete(known[1:], [4], sampling))
 
 
 def test_images_without_seeds_are_computed_one_by_one(name):

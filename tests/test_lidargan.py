@@ -243,7 +243,6 @@ def test_rows_that_cannot_be_are_refused(settings):
         (LidarVaeConfig, {"latent_dim": 0}),
         (LidarVaeConfig, {"free_nats": math.nan}),
         (VaeSampling, {"spread": -1.0}),
-        (VaeSampling, {"search_steps": 0}),
     ],
 )
 def test_settings_that_cannot_be_are_refused(cls, settings):
@@ -274,8 +273,8 @@ def test_a_scan_is_learned_by_heart_and_given_back():
     known = in_box(batch.range_m[..., None] * SENSOR.ray_directions())
     known[:, :40] = False
     spread_m = (batch.range_m - batch.range_m[known].mean()).abs()[known].mean()
-    for found in (generator.reconstruct(batch), generator.invert(batch, [0], VaeSampling(search_steps=20))):
-        assert float((found.range_m - batch.range_m).abs()[known].mean()) < 0.6 * float(spread_m)
+    found = generator.reconstruct(batch)
+    assert float((found.range_m - batch.range_m).abs()[known].mean()) < 0.6 * float(spread_m)
 
 
 def test_the_weight_of_the_divergence_rises_over_the_first_scans():

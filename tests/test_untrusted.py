@@ -260,7 +260,6 @@ def test_a_device_without_numbers_is_refused():
         ("lidm", "steps"),
         ("maskgit", "steps"),
         ("dusty", "search_steps"),
-        ("lidarvae", "search_steps"),
         ("lidargen", "levels"),
         ("lidargen", "steps_each"),
     ],

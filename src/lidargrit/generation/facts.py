@@ -13,7 +13,6 @@ CAPABILITIES = {  # name → what a generator with it can do besides sampling, f
     "tokens": "turn scans into tokens and back",
     "encode": "encode scans and reconstruct them",
     "complete": "fill in the pixels of a scan that were not observed",
-    "invert": "invert a scan: search the latent whose scan is nearest to it",
     "likelihood": "compute the likelihood of a scan",
 }
 
@@ -69,7 +68,7 @@ class SystemFacts:
 
         Args:
             sampling: settings of sampling with their defaults, by their names.
-            not_of_sampling: names of those settings that only completing or inverting a scan reads.
+            not_of_sampling: names of those settings that only completing a scan reads.
         """
         origin = "; ".join(part for part in (self.paper, self.program) if part) or "this project"
         settings = {

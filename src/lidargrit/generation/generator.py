@@ -38,13 +38,14 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     ``capabilities``; asked for more, it answers which generators can.
 
     The public methods check their arguments and form batches, the same for all. A subclass writes ``_sample``, and for
-    its capabilities ``_complete``, ``_invert``, ``_reconstruct``, ``_bits`` and ``get_tokenizer``; these get valid
-    arguments on the generator's device, in evaluation mode and without gradients.
+    its capabilities ``_complete``, ``_reconstruct``, ``_bits`` and ``get_tokenizer``; these get valid arguments on the
+    generator's device, in evaluation mode and without gradients.
     """
 
     Sampling: ClassVar[type] = SamplingSettings
     not_of_sampling: ClassVar[frozenset[str]] = frozenset()
-    """Names of those settings in ``Sampling`` that only completing or inverting a scan reads."""
+    """Names of those settings in ``Sampling`` that only completing a scan reads."""
+
     capabilities: ClassVar[frozenset[str]] = frozenset()
     own_batches: ClassVar[tuple[int, int]] = (1, 8)
     """Number of scans that are computed at once on a CPU, and on a GPU, where the caller names none."""
@@ -74,7 +75,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @classmethod
     def quickest_sampling(cls) -> SamplingT:
-        """Return the settings that take the least time to sample, complete or invert, for tests and first trials."""
+        """Return the settings that take the least time to sample or complete, for tests and first trials."""
         return cls.Sampling()
 
     @classmethod
@@ -223,23 +224,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     @final
     @inference()
-    def invert(self, images: RangeImage, seeds: Sequence[int], sampling: SamplingT | None = None) -> RangeImage:
-        """Return for each scan the nearest one that the generator can generate (capability ``invert``).
-
-        Args:
-            images: batch of range images (B, H, W).
-            seeds: seeds, one for each image, from 0 to 2^32 - 1; the search starts at random.
-            sampling: settings of the generator's own ``Sampling``; its defaults if not given.
-        """
-        self._require("invert")
-        check_images(images, self.sensor)
-        check_seeds(seeds, len(images))
-        settings, images = self._settings(sampling, self.Sampling), images.to(self.device)
-        self.eval()
-        return in_batches(seeds, self.batch_size(settings), lambda at, some: self._invert(images[at], some, settings))
-
-    @final
-    @inference()
     def bits(
         self, images: RangeImage, step_mm: int = 10, expected: bool = False, condition: Condition = NOTHING
     ) -> ScanBits:
@@ -278,9 +262,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         """Generate scans that agree with the observed values, which the caller then puts in."""
-        raise NotImplementedError
-
-    def _invert(self, images: RangeImage, seeds: BatchSeeds, sampling: SamplingT) -> RangeImage:
         raise NotImplementedError
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:

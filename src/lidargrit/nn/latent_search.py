@@ -15,24 +15,22 @@ def search_latents(
     error_of: Callable[[Tensor], Tensor],
     noise: Float[Tensor, "B steps_and_start D"],
     rate: float,
-    on_sphere: bool = True,
 ) -> Float[Tensor, "B D"]:
     """Search the latent of the least error for each row of a batch, independently.
 
-    Noise is added at first, to leave local minima.
+    Latents stay on the sphere on which almost all random ones lie. Noise is added at first, to leave local minima.
 
     Args:
         error_of: function from latents (B, D) to one error for each, which depends on that latent alone.
         noise: standard normal numbers: the start of the search, then one disturbance for each step.
         rate: highest learning rate of Adam.
-        on_sphere: whether latents stay on the sphere on which almost all random ones lie.
 
     Source:
         Karras et al., StyleGAN2, 2020, appendix D, with the numbers and the sphere of kazuto1011/dusty-gan@0374a5e,
         evaluate_reconstruction.py.
     """
     steps = noise.shape[1] - 1
-    latents = (_on_sphere(noise[:, 0]) if on_sphere else noise[:, 0].clone()).requires_grad_()
+    latents = _on_sphere(noise[:, 0]).requires_grad_()
     optimiser = torch.optim.Adam([latents], lr=rate)
     for step in range(steps):
         done = step / steps
@@ -41,8 +39,7 @@ def search_latents(
             shaken = latents + _NOISE * max(0.0, 1 - done / _NOISE_ENDS) ** 2 * noise[:, step + 1]
             (latents.grad,) = torch.autograd.grad(error_of(shaken).sum(), latents)
         optimiser.step()
-        if on_sphere:
-            latents.data = _on_sphere(latents.data)
+        latents.data = _on_sphere(latents.data)
     return latents.detach()
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.func import functional_call
 
@@ -91,7 +91,7 @@ class DustyConfig(Settings):
 
 @dataclass(frozen=True)
 class DustySampling(SamplingSettings):
-    """Settings of sampling, and of the search for the latent of a scan.
+    """Settings of sampling, and of the search for the latent by which a scan is completed.
 
     Args:
         mask: method by which returns are decided. ``bernoulli`` samples each return with its probability, as the
@@ -130,7 +130,7 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     )
     Sampling = DustySampling
     not_of_sampling = frozenset({"search_steps", "search_rate"})
-    capabilities = frozenset({"complete", "invert"})
+    capabilities = frozenset({"complete"})
     published_files = ("generator",)
 
     def __init__(self, config: DustyConfig, sensor: SensorModel) -> None:
@@ -192,13 +192,9 @@ class Dusty(Generator[DustyConfig, DustySampling]):
             raise CheckpointError(got, "one that its program saved", "check the path") from None
         return read, {"synthesis": weights}
 
-    def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
-        return self._generate(self._search(images, images.return_mask, seeds, sampling), seeds, sampling)
-
     def _complete(self, condition: Observed, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         """Return the nearest scans that the network generates, by the observed returns alone."""
-        latents = self._search(condition.images, condition.images.return_mask, seeds, sampling)
-        return self._generate(latents, seeds, sampling)
+        return self._generate(self._search(condition.images, seeds, sampling), seeds, sampling)
 
     def _generate(self, latents: Tensor, seeds: Sequence[int], sampling: DustySampling) -> RangeImage:
         encoded, logits = self.synthesis(latents)
@@ -224,15 +220,13 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     def _latent_like(self, tensor: Tensor) -> Tensor:
         return tensor.to(self.synthesis.project.weight)
 
-    def _search(
-        self, images: RangeImage, observed: Bool[Tensor, "B H W"], seeds: Sequence[int], sampling: DustySampling
-    ) -> Float[Tensor, "B D"]:
-        """Return the latents whose clean ranges are nearest to the observed returns, by mean inverse range error."""
-        target = self.encoding.encode(images)[:, 0]
+    def _search(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> Float[Tensor, "B D"]:
+        """Return the latents whose clean ranges are nearest to those of the returns, by mean inverse range error."""
+        target, returned = self.encoding.encode(images)[:, 0], images.return_mask
 
         def error_of(latents: Tensor) -> Tensor:
             distance = (self.synthesis(latents)[0][:, 0] - target).abs() / 2
-            return (distance * observed).sum((1, 2)) / observed.sum((1, 2)).clamp(min=1)
+            return (distance * returned).sum((1, 2)) / returned.sum((1, 2)).clamp(min=1)
 
         return search_latents(error_of, self._latents(seeds, sampling.search_steps + 1), sampling.search_rate)
 

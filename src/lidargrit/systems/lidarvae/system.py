@@ -3,21 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.core.configuration import COUNTS_SCANS, Settings
-from lidargrit.core.typed_values import Bounds, Count, NotNegative, Weight
-from lidargrit.core.untrusted import SEARCH_STEPS_AT_MOST
+from lidargrit.core.typed_values import Count, NotNegative, Weight
 from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.latent_search import search_latents
 from lidargrit.nn.processes import num_processes
 from lidargrit.nn.random import normal_latents
 from lidargrit.scans.condition import Condition, Observed
@@ -62,18 +59,14 @@ class LidarVaeConfig(Settings):
 
 @dataclass(frozen=True)
 class VaeSampling(SamplingSettings):
-    """Settings of completing and inverting scans; sampling itself has none.
+    """Settings of completing scans; sampling itself has none.
 
     Args:
         spread: factor on the standard deviations by which a latent is sampled around the mean latent of the observed
             pixels when a scan is completed; 0 takes the mean, as the paper does in its evaluation.
-        search_steps: number of steps of the optimiser that searches for a latent.
-        search_rate: highest learning rate of that optimiser.
     """
 
     spread: Weight = 1.0
-    search_steps: Annotated[int, Bounds(1, SEARCH_STEPS_AT_MOST)] = 300
-    search_rate: Weight = 0.05
 
 
 class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
@@ -89,7 +82,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
 
     Config = LidarVaeConfig
     Sampling = VaeSampling
-    not_of_sampling = frozenset({"spread", "search_steps", "search_rate"})
+    not_of_sampling = frozenset({"spread"})
     trains = (("autoencoder", "image", "encode", "decode"),)
     facts = SystemFacts(
         generates="range; every ray of 40 rows returns, and no ray of the others",
@@ -97,7 +90,7 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         program="pclucas14/lidar_generation@2a2c8bc (no licence)",
         weights_licence="no licence stated",
     )
-    capabilities = frozenset({"encode", "complete", "invert"})
+    capabilities = frozenset({"encode", "complete"})
     published_files = ("autoencoder",)
 
     def __init__(self, config: LidarVaeConfig, sensor: SensorModel) -> None:
@@ -111,11 +104,6 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
     def smallest_config(cls, sensor: SensorModel) -> LidarVaeConfig:
         """Return networks of 2 to 16 channels for 24 rows, with weights so large that untrained scans differ."""
         return LidarVaeConfig(latent_dim=4, channels=2, rows=24, first_row=sensor.height - 24, initial_std=0.5)
-
-    @classmethod
-    def quickest_sampling(cls) -> VaeSampling:
-        """Return a search of 4 steps."""
-        return VaeSampling(search_steps=4)
 
     @property
     def full_rows(self) -> range:
@@ -146,20 +134,8 @@ class LidarVae(Generator[LidarVaeConfig, VaeSampling]):
         latents = mean + sampling.spread * (log_variance / 2).exp() * self._latents(seeds)
         return self.image.decode(self.decode(latents))
 
-    def _invert(self, images: RangeImage, seeds: Sequence[int], sampling: VaeSampling) -> RangeImage:
-        """Search from the encoder's mean for the latent whose image is nearest in mean absolute difference."""
-        target = self.image.encode(images)
-
-        def error_of(latents: Tensor) -> Tensor:
-            return (self.decode(latents) - target).abs().mean(dim=(1, 2, 3))
-
-        noise = self._latents(seeds, sampling.search_steps + 1)
-        noise[:, 0] = self.encode(target).chunk(2, dim=1)[0]
-        # Means of dimensions that tell nothing lie near 0, far within the sphere of random latents.
-        return self.image.decode(self.decode(search_latents(error_of, noise, sampling.search_rate, on_sphere=False)))
-
-    def _latents(self, seeds: Sequence[int], *count: int) -> Float[Tensor, "B *count D"]:
-        return normal_latents(seeds, *count, self.config.latent_dim).to(self.device)
+    def _latents(self, seeds: Sequence[int]) -> Float[Tensor, "B D"]:
+        return normal_latents(seeds, self.config.latent_dim).to(self.device)
 
     @classmethod
     def read_published(
