@@ -85,10 +85,10 @@ def test_a_forecast_is_a_sample_given_the_scans_before_it(run, recorded, tmp_pat
     assert main(words) == 0
     written = KittiBin.read(tmp_path / "out" / "sequences" / "00" / "velodyne" / "000000.bin")
     dataset = open_dataset(recorded)
-    range_m = torch.stack([project(dataset.scan(at), SENSOR.fine()).range_m for at in range(3)])[None]
+    range_m = torch.stack([project(dataset.scan(at), SENSOR.fine()).range_m for at in (1, 2)])[None]
     poses = [pose for at in range(4) if (pose := dataset.motion(at).pose) is not None]
-    transforms = torch.stack([transform_between(pose, poses[3]) for pose in poses[:3]])[None]
-    past = Past(range_m, transforms, torch.tensor([[0.6, 0.4, 0.2]], dtype=torch.float64), SENSOR)
+    transforms = torch.stack([transform_between(pose, poses[3]) for pose in poses[1:3]])[None]
+    past = Past(range_m, transforms, torch.tensor([[0.4, 0.2]], dtype=torch.float64), SENSOR)
     sampled = forecaster().sample([scan_seed(4, 0)], past)[0]
     ours, wanted = ({tuple(point) for point in scan.points_xyz_m.tolist()} for scan in (written, unproject(sampled)))
     assert ours == wanted
@@ -104,24 +104,26 @@ def test_the_likelihood_of_a_drive_is_the_sum_of_scans_given_their_pasts(recorde
         kept_m = fine_m[now : now + 1, :, ::4].contiguous()
         past = Past.nothing(SENSOR, 1, 1)
         if now:
-            transforms = torch.stack([torch.linalg.inv(way(4)[now]) @ pose for pose in way(now)])[None]
-            past = Past(fine_m[None, :now], transforms, torch.arange(now, 0, -1).double()[None] / 5, SENSOR)
+            before = range(max(0, now - 2), now)  # as many as the forecaster takes
+            transforms = torch.stack([torch.linalg.inv(way(4)[now]) @ way(4)[then] for then in before])[None]
+            ages_s = torch.tensor([[(now - then) / 5 for then in before]], dtype=torch.float64)
+            past = Past(fine_m[None, before.start : now], transforms, ages_s, SENSOR)
         bits = forecaster().bits(RangeImage(kept_m, kept_m > 0, SENSOR), condition=past).total()
         assert found.parts["mask"][now] + found.parts["range"][now] == pytest.approx(float(bits), rel=1e-4)
 
 
 def test_a_drive_goes_on_by_its_own_poses_or_at_constant_speed(recorded):
-    known = continued(recorded, SENSOR, 3, after=1, constant_speed=False)
-    constant = continued(recorded, SENSOR, 3, after=1, constant_speed=True)
+    known = continued(recorded, forecaster(), 3, after=1, constant_speed=False)
+    constant = continued(recorded, forecaster(), 3, after=1, constant_speed=True)
     for poses in (known.poses, constant.poses):  # all steps are alike there
         np.testing.assert_allclose(torch.stack([*poses]), torch.stack(way(5)[2:]), atol=1e-6)
     assert (known.begin_s, known.period_s) == pytest.approx((0.4, 0.2))
-    assert len(known.seen) == 2
+    assert len(known.seen) == len(continued(recorded, forecaster(), 1, after=3, constant_speed=True).seen) == 2
 
 
 def test_what_cannot_be_forecast_is_told_in_one_line(run, recorded, tmp_path):
     with pytest.raises(DataError, match=r"4 scans in a row .* --after 7; wanted two scans before the first forecast"):
-        continued(recorded, SENSOR, 1, after=7, constant_speed=False)
+        continued(recorded, forecaster(), 1, after=7, constant_speed=False)
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 5 0 0 0 0 0 1\n")
     with pytest.raises(ConfigError, match=r"30 scans, 0.1 s apart, along .* which lasts 1.0 s"):
         path_of(30, tmp_path / "poses.txt")

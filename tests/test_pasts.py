@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidargrit.cli import main
 from lidargrit.core.errors import DataError
 from lidargrit.data.batches import Batches
 from lidargrit.data.drives import DriveConfig, write_drives
@@ -12,10 +13,15 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.sources import load_range_images
 from lidargrit.data.windows import TimedScan, drives_in
+from lidargrit.generation.generator import load
+from lidargrit.generation.settings import Preset, TrainingConfig
+from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.motion import Motion
 from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.warp import warp
+from lidargrit.systems.forecaster.system import Forecaster, ForecasterObjective
+from lidargrit.training import train
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128, 4)
 CONFIG = DataConfig(columns=128, column_stride=4, workers=1)
@@ -67,6 +73,34 @@ def test_batches_tell_the_past_of_images_that_begin_anywhere_and_are_turned(driv
     for at in with_past:
         assert error_m(at, at) < 0.2
         assert all(error_m(other, at) > 0.5 for other in range(6) if other != at)
+
+
+def test_a_forecaster_is_told_as_many_past_scans_as_its_configuration_says(drives, tmp_path, monkeypatch):
+    """In training, validation, evaluation, forecasts and compression; five were told in training whatever it said."""
+    told, decoded, sample = set[int](), ForecasterObjective.decoded, Forecaster._sample
+
+    def learn(objective, example, rng):
+        told.add(example.condition.range_m.shape[1])
+        return decoded(objective, example, rng)
+
+    def forecast(model, seeds, condition, sampling):
+        forecast_from.append(condition.range_m.shape[1])
+        return sample(model, seeds, condition, sampling)
+
+    monkeypatch.setattr(ForecasterObjective, "decoded", learn)
+    monkeypatch.setattr(Forecaster, "_sample", forecast)
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+    source, run, forecast_from = (str(drives / "prepared"),), tmp_path / "run", list[int]()
+    data = DataConfig(source, source, columns=128, column_stride=4, workers=1, condition="past")
+    fit = TrainingConfig(2, 2, 1e-3, validate_every=2, validation_scans=2, checkpoint_every=2, average_over_scans=0)
+    train(Preset("two scans", "forecaster", Forecaster.smallest_config(SENSOR), data, {"pixels": fit}), run)
+    assert told == {2}
+    assert load(run).past_scans == ScanCodec(load(run), 10).past_scans == 2
+    tree = f"kitti_odometry:{drives / 'tree'}:01"  # whose car moves
+    assert main(["forecast", tree, str(tmp_path / "next"), "--model", str(run), "-n", "2"]) == 0
+    words = ["--protocol", "forecast", "--model", str(run), "--set", "data.columns=128", "data.column_stride=4"]
+    assert main(["evaluate", tree, *words]) == 0  # three scans are enough
+    assert {*forecast_from} == {2}
 
 
 def moving(times_s: list[float | None], places_m: list[float | None]) -> list[TimedScan]:

@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> None:
 
     run_folder = locate(options.model, "drive")
     generator = load(run_folder).to(usable_device(options.device))
-    way = continued(options.drive, generator.sensor, options.count, options.after, options.constant_speed)
+    way = continued(options.drive, generator, options.count, options.after, options.constant_speed)
     sampling = generator.parse_sampling(sampling_words(options.set))
     facts = {name: vars(options)[name] for name in ("drive", "after", "constant_speed")}
     count = write_drives(generator, run_folder, options.out, [way], [options.seed], sampling, **facts)

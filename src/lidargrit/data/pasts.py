@@ -19,11 +19,11 @@ class Pasts:
 
     Args:
         images: range images whose sources have all fine columns, and times and poses of some.
-        scans: number of past scans, K.
+        count: number of past scans, K.
     """
 
-    def __init__(self, images: RangeImages, scans: int) -> None:
-        self._fine, self._sensor, self._count = images.with_fine_columns(), images.sensor, scans
+    def __init__(self, images: RangeImages, count: int) -> None:
+        self._fine, self._sensor, self.count = images.with_fine_columns(), images.sensor, count
         self._scans = images.timed_scans()
         self.drives = drives_in(self._scans)
         self._place = {number: (drive, at) for drive in self.drives for at, number in enumerate(drive)}
@@ -61,11 +61,11 @@ class Pasts:
         return pasts.turned(torch.tensor(first_columns)) if first_columns and any(first_columns) else pasts
 
     def _past(self, index: int, gap: int) -> Past:
-        past = Past.nothing(self._sensor, 1, self._count)
+        past = Past.nothing(self._sensor, 1, self.count)
         drive, at = self._place.get(index, ([], 0))
         now = self._scans[index].motion
-        for slot in range(self._count):
-            before = at - gap - (self._count - 1 - slot)
+        for slot in range(self.count):
+            before = at - gap - (self.count - 1 - slot)
             if before < 0:
                 continue
             then = self._scans[drive[before]].motion

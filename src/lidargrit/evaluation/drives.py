@@ -29,7 +29,6 @@ from lidargrit.evaluation.drive_errors import (
 from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.odometry import INSTALL, SETTLING_SCANS, kiss_icp_is_there, path_by_kiss_icp, path_errors
 from lidargrit.evaluation.protocols import load_protocol, public_name
-from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
 from lidargrit.nn.devices import usable_device
@@ -40,7 +39,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.scans.warp import warp
 
-_PAST_SCANS = PastTold.past_scans
+_PAST_SCANS = 5  # of forecasts without a model
 _STANDS_M_PER_S = 0.5  # below, a forecast is as good as the last scan
 _LONGEST_OFF = 0.25  # of a horizon, by which the nearest whole number of steps may miss it
 _TTCE_STEPS, _CTC_STEPS = (3, 4), (1, 2, 3, 4)
@@ -92,10 +91,10 @@ class _Drives:
         name = config.sensor or load_protocol(config.protocol).sensor
         named = replace(data, sensor=name).load_sensor() if name else None
         images = source.images(model.sensor if model else named, source.as_projected(data))
-        return cls(images, Pasts(images, _PAST_SCANS))
+        return cls(images, Pasts(images, model.past_scans if model else _PAST_SCANS))
 
     def windows(self, horizon_s: float, at_most: int) -> list[tuple[int, int]]:
-        """Return scans that are so many seconds after a past of five scans, each with the steps to the latest one."""
+        """Return scans that are so many seconds after a whole past, each with the steps to the latest one."""
         found = []
         for drive in self.pasts.drives:
             times_s = [self.pasts.motion(number).time_s or 0.0 for number in drive]
@@ -104,16 +103,18 @@ class _Drives:
             period_s = median(np.diff(times_s))
             gap = max(1, round(horizon_s / period_s))
             if abs(gap * period_s - horizon_s) <= _LONGEST_OFF * horizon_s:
-                found += [(number, gap) for number in drive[gap + _PAST_SCANS - 1 :]]
+                found += [(number, gap) for number in drive[gap + self.pasts.count - 1 :]]
         return [found[at] for at in evenly_spaced(at_most or len(found), len(found))]
 
 
 def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple[str, dict[str, Any]]:
-    """Forecast scans of drives from the five before them, whose poses and their own are known.
+    """Forecast scans of drives from those before them, whose poses and their own are known.
+
+    They are as many as the model takes, and five without one.
 
     Scans of a car that stands are left out. Besides the model, these are forecast: ``copied``, the last scan;
-    ``warped``, its returns moved by the car's motion; ``warped_cache``, those of all five; and the same by the poses
-    that follow from a constant speed.
+    ``warped``, its returns moved by the car's motion; ``warped_cache``, those of all past scans; and, given two
+    or more, the same by the poses that follow from a constant speed.
 
     Args:
         model: run of a generator that takes a past; none if empty.
@@ -130,7 +131,7 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
         title = f"{', '.join(f'{each:g}' for each in horizons_s)} s ahead"
         count = len(next(iter(errors.values()), []))
         if not count:
-            lacking = f"{title}: no drive of {source} moves and is so long, with {_PAST_SCANS} scans before"
+            lacking = f"{title}: no drive of {source} moves and is so long, with {drives.pasts.count} scans before"
             tables.append(Table(sentences=(lacking,)))
             continue
         rows = {name: _estimates(each) for name, each in errors.items()}
@@ -142,7 +143,8 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
         values.append({**at, "scans": count, "standing": standing, "forecasts": plain})
     if not values:
         cure = "name longer ones: lidargrit simulate DRIVES --frames 12 -n 120"
-        raise DataError(f"drives of {source} of which none moves for {_PAST_SCANS + 1} scans", "longer drives", cure)
+        got = f"drives of {source} of which none moves for {drives.pasts.count + 1} scans"
+        raise DataError(got, "longer drives", cure)
     departures = load_protocol(named).departures
     tables.append(Table(sentences=tuple(f"differs from its source: {each}" for each in departures)))
     about = {"protocol": named, "samples": source, "model": model, "settings": config.facts()}
@@ -196,17 +198,22 @@ def baselines(past: Past, gap: int) -> dict[str, Float64[Tensor, "H W"]]:
         gap: steps from the latest past scan to the one that is forecast.
     """
     warped = warp(past)
-    steady = warp(constant_speed(past, gap))
-    return {
+    found = {
         "copied": warped.copied_m[0],
         "warped": warped.last.range_m[0],
         "warped_cache": warped.nearest.range_m[0],
-        "warped_cache, constant speed": steady.nearest.range_m[0],
     }
+    if past.range_m.shape[1] > 1:  # one scan alone tells no speed
+        found["warped_cache, constant speed"] = warp(constant_speed(past, gap)).nearest.range_m[0]
+    return found
 
 
 def constant_speed(past: Past, gap: int) -> Past:
-    """Return the past as it would be if the sensor went on as in its last step, for that many steps."""
+    """Return the past as it would be if the sensor went on as in its last step, for that many steps.
+
+    Args:
+        past: past of two scans or more.
+    """
     to_latest = torch.linalg.inv(past.transforms[:, -1:]) @ past.transforms
     step = to_latest[:, -2:-1]  # from the frame before the latest one to that
     return replace(past, transforms=torch.linalg.matrix_power(step, gap) @ to_latest)

@@ -21,7 +21,6 @@ from lidargrit.data.sources import RunSource, open_source, overlap
 from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
-from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.bits import ScanBits
@@ -146,7 +145,7 @@ def _pasts(generator: Generator, scans: RangeImages | EvalSet) -> Pasts | None:
     """Return the pasts of scans of drives for a generator that takes them; None for other scans and generators."""
     if Past in generator.takes and isinstance(scans, RangeImages):
         with suppress(DataError):  # of scans that are no drives
-            return Pasts(scans, PastTold.past_scans)
+            return Pasts(scans, generator.past_scans)
     return None
 
 

@@ -108,6 +108,14 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return frozenset({"pixels"} if "complete" in self.capabilities else set())
 
     @property
+    def past_scans(self) -> int:
+        """Number of scans before each in its drive that it is told in training, and afterwards; 0 if it takes no past.
+
+        It may depend on ``config``.
+        """
+        return 0
+
+    @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages of training, in their order; they may depend on ``config``."""
         there = dict(self.named_children())

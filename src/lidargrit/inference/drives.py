@@ -15,7 +15,6 @@ from torch import Tensor
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError, DataError
-from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.run_folder import locate
@@ -23,7 +22,6 @@ from lidargrit.data.scan_folder import KittiTree, ScanFolder
 from lidargrit.data.sources import open_source
 from lidargrit.data.trajectories import read_trajectory
 from lidargrit.data.windows import drives_in
-from lidargrit.generation.conditions.past import PastTold
 from lidargrit.generation.generator import Generator, SamplingT, load
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.scans.condition import NOTHING, Condition
@@ -31,7 +29,6 @@ from lidargrit.scans.fine_columns import in_fine_columns
 from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
-from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
 MANIFEST = "drive.json"
@@ -95,11 +92,12 @@ def path_of(frames: int, path: Path | None = None) -> Way:
     return Way((), [*poses])
 
 
-def continued(drive: str, sensor: SensorModel, frames: int, after: int | None, constant_speed: bool) -> Way:
+def continued(drive: str, generator: Generator[Any, Any], frames: int, after: int | None, constant_speed: bool) -> Way:
     """Return the way on from a scan of a recorded drive.
 
     Args:
         drive: source of scans with times and poses; the last of its drives counts.
+        generator: generator of the scans to come, whose sensor and number of past scans decide what is seen.
         frames: number of scans to come.
         after: number of the last scan that is seen, from 0; the last one of the drive if not given.
         constant_speed: whether later poses of the drive are left alone. Where it has none, the last step is repeated.
@@ -114,18 +112,17 @@ def continued(drive: str, sensor: SensorModel, frames: int, after: int | None, c
     motions = [scans[number].motion for number in numbers]
     times_s = [motion.time_s or 0.0 for motion in motions]
     known = [motion.pose for motion in motions if motion.pose is not None]  # all of a drive's have one
-    first = max(0, last + 1 - PastTold.past_scans)
-    seen = [Seen(_fine(dataset, numbers[at], sensor), known[at], times_s[at]) for at in range(first, last + 1)]
+    first = max(0, last + 1 - generator.past_scans)
+    fine = generator.sensor.fine()
+    seen = [
+        Seen(project(dataset.scan(numbers[at]), fine).range_m, known[at], times_s[at]) for at in range(first, last + 1)
+    ]
     poses = known[: last + 1] if constant_speed else known[: last + 1 + frames]
     step = transform_between(poses[-1], poses[-2])
     while len(poses) < last + 1 + frames:
         poses.append(poses[-1] @ step)
     period_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
     return Way(seen, poses[last + 1 :], times_s[last] + period_s, period_s)
-
-
-def _fine(dataset: ScanDataset, index: int, sensor: SensorModel) -> Float[Tensor, "H fine_W"]:
-    return project(dataset.scan(index), sensor.fine()).range_m
 
 
 def opening_of(name: str | Path) -> Generator[Any, Any] | None:
@@ -202,8 +199,9 @@ class _Drive:
         way, missing = self._way, [not file.exists() for file in self._files]
         if not any(missing):
             return
-        begin = max(0, missing.index(True) - PastTold.past_scans)
-        seen = deque([] if begin else way.seen, PastTold.past_scans)
+        past_scans = self._generator.past_scans
+        begin = max(0, missing.index(True) - past_scans)
+        seen = deque([] if begin else way.seen, past_scans)
         for frame in range(begin, len(self._files)):
             time_s = way.begin_s + frame * way.period_s
             if missing[frame]:

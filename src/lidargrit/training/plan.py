@@ -16,6 +16,7 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.condition import Nothing
+from lidargrit.scans.past import Past
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.stage import follow_settings
@@ -118,12 +119,14 @@ class CheckedStages:
         taken: trained stages of another run, which are taken as they are or trained further.
         frozen: run from which a stage is taken as it is, by the name of the stage; the others are trained.
         told: source of the condition that the generator is told of each scan.
+        past_scans: number of scans before each in its drive that the generator is told instead; 0 for none.
     """
 
     objectives: Mapping[str, Objective]
     taken: Mapping[str, Objective]
     frozen: Mapping[str, str]
     told: ToldOfScans
+    past_scans: int
 
     @property
     def trained(self) -> dict[str, Objective]:
@@ -156,7 +159,8 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     if told.kind is not Nothing and told.kind not in generator.takes:
         got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, which cannot be told it"
         raise ConfigError(got, "a generator that takes it", "leave it out")
-    checked = CheckedStages(objectives, taken, preset.frozen, told)
+    past_scans = generator.past_scans if told.kind is Past else 0
+    checked = CheckedStages(objectives, taken, preset.frozen, told, past_scans)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)
     return checked

@@ -3,7 +3,7 @@
 from lidargrit.evaluation.protocols import Protocol
 
 forecast = Protocol(
-    title="forecasts of drives from five scans: L1, AbsRel, chamfer, beside copied and warped scans",
+    title="forecasts of drives from past scans (five without a model): L1, AbsRel, chamfer, beside copied ones",
     source="Khurana et al., Point Cloud Forecasting as a Proxy for 4D Occupancy Forecasting, CVPR 2023",
     metrics=(),
     departures=(

@@ -18,7 +18,7 @@ gem = Protocol(
         "compares with images, not with the scans",
         "the program scores the first 500 scans of each drive, each as often as one of its windows forecasts it; here "
         "every scan with five before it, once at each horizon",
-        "the program's past are five scans as far apart as the forecasts are; here five in a row",
+        "the program's past are five scans as far apart as the forecasts are; here they follow one another",
         "its L1 and AbsRel are not built: those of the protocol forecast are of the same rays, without the clamping",
     ),
 )

@@ -13,8 +13,6 @@ class ToldOfScans(ABC):
 
     kind: ClassVar[type[Condition]]
     """Conditions that it returns; a generator that learns by them has them in ``takes``."""
-    past_scans: ClassVar[int] = 0
-    """Number of scans before each in its drive that are told in place of what :meth:`of` returns; 0 for none."""
 
     @abstractmethod
     def of(self, images: RangeImage) -> Condition:

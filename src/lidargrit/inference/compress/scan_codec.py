@@ -72,7 +72,7 @@ class ScanCodec:
             self._tokenizer.cpu().double().eval().requires_grad_(False)
         self._pixels = copy.deepcopy(pixels).cpu().double().eval().requires_grad_(False)
         self._past = None if past is None else copy.deepcopy(past).cpu().double().eval().requires_grad_(False)
-        self.past_scans = 0 if past is None else past.scans
+        self.past_scans = generator.past_scans
 
     def digest(self) -> str:
         """Return a hash of all that probabilities depend on: weights, their sizes, and the sensor."""

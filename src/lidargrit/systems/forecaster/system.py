@@ -40,7 +40,7 @@ class ForecasterConfig(Settings):
 
     Args:
         pixels: sizes of the pixel decoder.
-        past_scans: number of past scans that a scan is given.
+        past_scans: number of past scans that a scan is given, in training and afterwards.
         past_width: number of channels of the network over what past scans have on the present rays.
         past_blocks: number of its residual blocks.
         own_past: share of the examples of training whose past ends with scans that the model samples itself, so that
@@ -85,6 +85,11 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
     def takes(self) -> frozenset[type[Condition]]:
         """Return that scans are sampled given their past, or nothing."""
         return frozenset({Nothing, Past})
+
+    @property
+    def past_scans(self) -> int:
+        """Number of past scans, as the configuration says."""
+        return self.config.past_scans
 
     def fit_statistics(self, images: RangeImages) -> None:
         """Take how often each ray returns in the training scans."""
