@@ -123,10 +123,10 @@ class _Completion:
         """Open scans and folder; ``completed.json`` says how the files were made, and of which scans."""
         reader = replace(task.reader(model.sensor, model.projection_variant), projection=model.projection)
         inputs = open_inputs(source, reader, config)
-        inputs.check_output(out)
+        inputs.scans.check_output(out)
         files = _files(inputs, source, output)
         facts = {"verb": task.verb, "source": source, **task.identity(), **_facts(model, output)}
-        identities = [inputs.identity(number // output.count) for number in range(len(files))]
+        identities = [inputs.scans.identity(number // output.count) for number in range(len(files))]
         folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans)
         return cls(inputs, folder, model, task, output)
 
@@ -164,7 +164,7 @@ class _Completion:
             job = None
             with self.folder.leaving_out(*range(index * count, (index + 1) * count)):
                 seen = None if self.output.format == IMAGE else partial(self.task.see, model=self.model)
-                scan, number = self.inputs.read(index, seen), self.inputs.number(index)
+                scan, number = self.inputs.read(index, seen), self.inputs.scans.number(index)
                 condition = self.task.condition(scan, derive_seed(self.output.seed, number))
                 job = _Job(index, number, 0, scan, condition, self.inputs.form(index))
             if job is not None:
@@ -275,7 +275,7 @@ def _files(inputs: Inputs, source: str, output: OutputConfig) -> list[str]:
     if len(inputs) * output.count > _FILES_AT_MOST:
         got = f"{output.count:,} completions of each of {len(inputs):,} scans"
         raise ConfigError(got, f"at most {_FILES_AT_MOST:,} files", "ask for fewer")
-    names = [inputs.name(index) for index in range(len(inputs))]
+    names = [inputs.scans.name(index) for index in range(len(inputs))]
     if output.format == TREE:
         names = KittiTree(Path()).files(names)
     else:

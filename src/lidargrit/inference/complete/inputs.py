@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,7 +16,6 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_images, open_source
 from lidargrit.data.sources.named import ImageScans, PointScans, named_scans
-from lidargrit.data.windows import TimedScan
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.grid import RayGrid
 from lidargrit.scans.projection import (
@@ -92,47 +90,28 @@ class InputScan:
 
 
 class Inputs:
-    """The scans of a source, one after the other.
+    """The scans of a source, read one after the other.
 
     Args:
+        scans: source of names, numbers, and points or images.
         reader: projection of points to range images.
     """
 
     def __init__(self, scans: PointScans | ImageScans, reader: "ScanReader") -> None:
-        self._scans, self._reader = scans, reader
+        self.scans, self._reader = scans, reader
         self._counted = self._doubted = False
 
     def __len__(self) -> int:
-        return len(self._scans)
-
-    def name(self, index: int) -> str:
-        """Return the name of its file, without the ending."""
-        return self._scans.name(index)
-
-    def identity(self, index: int) -> str:
-        """Return what identifies it, so that another scan is not taken for it."""
-        return self._scans.identity(index)
-
-    def number(self, index: int) -> int:
-        """Return its number in the source, whatever other scans are taken."""
-        return self._scans.number(index)
-
-    def timed_scans(self) -> list[TimedScan]:
-        """Return when and where each scan was made, where that is known."""
-        return self._scans.timed_scans()
-
-    def check_output(self, out: Path) -> None:
-        """Refuse a folder whose files would become scans of the source, with an OutputError."""
-        self._scans.check_output(out)
+        return len(self.scans)
 
     def suffix(self, index: int) -> str:
         """Return the ending of its file; "" where it is not in a file of points."""
-        path = self._scans.path(index)
+        path = self.scans.path(index)
         return "" if path is None else path.name[len(formats.stem(path)) :]
 
     def form(self, index: int) -> type[ScanFormat] | None:
         """Return the format of its file; None where it has none."""
-        path = self._scans.path(index)
+        path = self.scans.path(index)
         return None if path is None or not formats.candidates(path) else formats.recognise(path)
 
     def read(self, index: int, see: Callable[[Scan], InputScan] | None = None) -> InputScan:
@@ -142,10 +121,10 @@ class Inputs:
             see: function that brings a cloud to the rays that all of its points lie on; not given, it becomes one image
                 of the reader's sensor. A range image stays as it is.
         """
-        if isinstance(self._scans, ImageScans):
-            return InputScan(self._scans.image(index))
-        points = self._scans.scan(index)
-        self._scans.tell_notes(points)
+        if isinstance(self.scans, ImageScans):
+            return InputScan(self.scans.image(index))
+        points = self.scans.scan(index)
+        self.scans.tell_notes(points)
         scan = self._reader.read(points) if see is None else see(points)
         if not self._counted and see is None:
             self._counted = True

@@ -16,6 +16,7 @@ from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, projection_variant
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format, write_array
+from lidargrit.data.sources.named import NamedScans
 from lidargrit.generation.generator import load
 from lidargrit.inference.complete.inputs import Inputs, ScanReader, open_inputs
 from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
@@ -53,9 +54,9 @@ def compress_scans(
     work = _Work(source, model, step_mm, config, "" if sensor is None else json.dumps(sensor.to_json()))
     compressor = _Compressor.of(work)
     inputs, chosen = compressor.inputs, {"source": source, "max_scans": config.max_scans}
-    names = [inputs.name(index) for index in range(len(inputs))]
+    names = [inputs.scans.name(index) for index in range(len(inputs))]
     check_names(source, names)  # of which a file has each once
-    _tell_of_drives(inputs, model)
+    _tell_of_drives(inputs.scans, model)
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(compressor.codec, model, sensor), chosen) as writer:
         missing = writer.missing([compressor.identity(index) for index in range(len(inputs))])
@@ -71,13 +72,13 @@ def compress_scans(
     return Compressed(len(returns), sum(returns), out.stat().st_size)
 
 
-def _tell_of_drives(inputs: Inputs, model: str) -> None:
+def _tell_of_drives(scans: NamedScans, model: str) -> None:
     """Say that the bundle of a model has one of drives, if the scans are some whose past is known."""
     of_drives = locate(model, "drive")
     if of_drives == locate(model):
         return
     try:
-        timed = inputs.timed_scans()
+        timed = scans.timed_scans()
     except DataError:  # in files beside the scans, which are not needed
         return
     drives = [one.recording for one in timed if one.motion.time_s is not None and one.motion.pose is not None]
@@ -104,7 +105,7 @@ class _Work:
 class _Compressor:
     def __init__(self, codec: ScanCodec, inputs: Inputs, skips: bool) -> None:
         self.codec, self.inputs, self._skips, self._told = codec, inputs, skips, False
-        self._drives = DrivesOfSource(inputs.timed_scans(), codec.past_scans) if codec.past_scans else None
+        self._drives = DrivesOfSource(inputs.scans.timed_scans(), codec.past_scans) if codec.past_scans else None
         self._image = lru_cache(maxsize=2 * codec.past_scans + 1)(self._read)
 
     @classmethod
@@ -116,7 +117,7 @@ class _Compressor:
 
     def identity(self, index: int) -> str:
         """Return what identifies a scan; of a drive its place, too, by which those behind it are compressed."""
-        named = self.inputs.identity(index)
+        named = self.inputs.scans.identity(index)
         return named if self._drives is None else f"{named}, placed at {self._drives.place(index, 0)[1:]}"
 
     def write(self, folder: Path, indices: Sequence[int]) -> int:
@@ -134,7 +135,7 @@ class _Compressor:
                 if not self._told and (lost := _not_kept(image)):
                     self._told = True
                     reporting.message(f".lgz keeps no {lost}")
-            add_scan(folder, index, (self.inputs.name(index), self.identity(index), returns), data)
+            add_scan(folder, index, (self.inputs.scans.name(index), self.identity(index), returns), data)
         return len(indices)
 
     def _read(self, index: int) -> RangeImage | ScanError:
