@@ -5,12 +5,13 @@ import pytest
 
 from lidargrit.scans import classes
 from lidargrit.scans.sensors import SensorSetup, load_sensor
-from lidargrit.simulator import materials, scene_of
+from lidargrit.simulator import materials
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 from lidargrit.simulator.mesh import Finish, Mesh, Objects, Shape
 from lidargrit.simulator.power import RaydropModel, Surfaces
 from lidargrit.simulator.tracing import NOTHING, Hits, Tracer, objects_in_reach
 from toy_scene import HEIGHT_M, box, road
+from whole_streets import mesh_of, mesh_of_objects, street_of
 
 SENSOR = load_sensor("hdl64e_kitti_360")
 ROUNDED = 2  # rays of 65,536 that run along an edge to the last bit may pass on its other side
@@ -37,16 +38,16 @@ def same(one, two):
 
 @pytest.mark.parametrize(("seed", "moves"), [(1, False), (12, False), (5, True)])
 def test_hits_are_those_of_one_mesh(seed, moves):
-    scene = scene_of(seed)
+    scene = street_of(seed)
     poses = [scene.sensor_pose(time_s) for time_s in ((0.4, 0.4 + REVOLUTION_S) if moves else (0.4,))]
     rays = Beams.sample(SENSOR, np.random.default_rng(seed), 0.0014).rays(*poses)
     objects = scene.objects(0.4)
     assert len(objects) > 40
-    whole, kept = Tracer(scene.mesh(0.4), 120.0), Tracer(scene.standing, 120.0, objects)
+    whole, kept = Tracer(mesh_of(scene, 0.4), 120.0), Tracer(scene.standing, 120.0, objects)
     first = whole.cast(*rays)
     same(by_part(first, len(scene.standing), objects), kept.cast(*rays))
     assert (first.triangle >= len(scene.standing)).mean() > 0.05
-    finishes = scene.mesh(0.4), Finish.join([scene.standing.finish(), objects.finish()])
+    finishes = mesh_of(scene, 0.4), Finish.join([scene.standing.finish(), objects.finish()])
     (behind, light), (behind_kept, light_kept) = (
         tracer.cast_through(*rays, tracer.cast(*rays), Surfaces.of(finish, RaydropModel(), SensorSetup()).passing())
         for tracer, finish in zip((whole, kept), finishes, strict=True)
@@ -94,7 +95,7 @@ def test_windows_wrap_and_boxes_around_the_sensor_span_all(frames):
     directions = np.stack((flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=1)
     origins = np.tile([0.0, 0.0, HEIGHT_M], (24_000, 1)) + np.linspace(0, 1, 24_000)[:, None] * [0.9, 0.2, 0.0]
     rays = origins.astype(np.float32), directions.astype(np.float32)
-    one = Tracer(Mesh.join([road(), objects.mesh()]), 60.0).cast(*rays)
+    one = Tracer(Mesh.join([road(), mesh_of_objects(objects)]), 60.0).cast(*rays)
     two = Tracer(road(), 60.0, objects).cast(*rays)
     same(by_part(one, 2, objects), two)
     assert (two.triangle >= 2).mean() > 0.002

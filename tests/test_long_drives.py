@@ -11,10 +11,11 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.drives import DriveConfig
 from lidargrit.scans import classes
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.simulator import FRAME_S, _road, frames_before_end, observe, poses_of, scene_of, simulate
+from lidargrit.simulator import FRAME_S, _road, frames_before_end, observe, poses_of, simulate
 from lidargrit.simulator.scene.long_road import LongRoad
 from lidargrit.simulator.scene.stretches import EXTENT_M, LENGTH_M
 from lidargrit.simulator.tracing import Tracer, objects_in_reach
+from whole_streets import mesh_of_objects, street_of
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(256)
 # Points, mean range and reflectance, mean class of frames of drives of 100 m or less, in streets of version 3 and 4.
@@ -41,7 +42,7 @@ def scan_of(seed, theme, frame, **options):
 
 
 def seconds_to(seed, theme, way_m):
-    return way_m / scene_of(seed, theme).speed_m_s
+    return way_m / street_of(seed, theme).speed_m_s
 
 
 def same_points(one, two):
@@ -52,7 +53,7 @@ def same_points(one, two):
 
 def boxes_around(scene, objects, pose, low, high):
     """Return the classes of what reaches into a box of the sensor's frame, by the bounds of its triangles."""
-    near = objects_in_reach(objects, [pose], range_max_m=5.0).mesh()
+    near = mesh_of_objects(objects_in_reach(objects, [pose], range_max_m=5.0))
     to_sensor, found = np.linalg.inv(pose), set()
     for mesh in (scene.standing, near):
         close = np.abs(mesh.triangles_m[:, 0] - pose[:3, 3]).max(axis=1) < 30
@@ -109,7 +110,7 @@ def test_returns_stay_level():
 def test_nothing_is_in_our_way(seed, theme):
     """Neither what stands, along both seams of a stretch, nor who comes towards us."""
     road, low, high = LongRoad(seed, theme), np.array([-2.3, -0.95, -1.15]), np.array([2.3, 0.95, 0.3])
-    speed_m_s = scene_of(seed, theme).speed_m_s
+    speed_m_s = street_of(seed, theme).speed_m_s
     for way_m in (*range(100, 150, 8), *range(325, 357, 8), 1200):
         time_s = way_m / speed_m_s
         scene = road.scene_at(time_s)
@@ -121,7 +122,7 @@ def test_nothing_is_in_our_way(seed, theme):
 def test_the_same_is_seen_before_and_after_another_stretch_is_near(seed, theme, way_m):
     """Rays from one place and at one time meet the same in both scenes: nothing appears, and no coordinate jumps."""
     road = LongRoad(seed, theme)
-    time_s = way_m / scene_of(seed, theme).speed_m_s
+    time_s = way_m / street_of(seed, theme).speed_m_s
     before, after = road.scene_at(time_s - 1e-6), road.scene_at(time_s + 1e-6)
     assert before is not after
     turn, rise = (a.ravel() for a in np.meshgrid(np.linspace(-np.pi, np.pi, 360), np.linspace(-0.4, 0.03, 24)))
@@ -142,7 +143,7 @@ def test_the_same_is_seen_before_and_after_another_stretch_is_near(seed, theme, 
 @pytest.mark.parametrize(("seed", "theme"), DRIVES)
 def test_the_ground_has_no_gap_where_stretches_meet(seed, theme):
     road = LongRoad(seed, theme)
-    speed_m_s = scene_of(seed, theme).speed_m_s
+    speed_m_s = street_of(seed, theme).speed_m_s
     u, v = (a.ravel() for a in np.meshgrid(np.linspace(-1.5, 1.5, 30), np.linspace(-40, 40, 81)))
     for number in (1, 2):  # the stretch that begins there
         begins_m = EXTENT_M + LENGTH_M * (number - 1)
@@ -163,7 +164,7 @@ def test_poses_are_those_of_the_scans_and_our_car_keeps_its_speed():
         seen = observe(seed, SENSOR, theme=theme, frame=frame, frames=FRAMES, kept_columns_only=True)
         assert np.array_equal(seen.sensor_pose, way[frame])
     step_m = np.linalg.norm(np.diff([pose[:3, 3] for pose in way], axis=0), axis=1)
-    assert step_m == pytest.approx(FRAME_S * scene_of(seed, theme).speed_m_s, rel=0.12)  # bends are shorter inside
+    assert step_m == pytest.approx(FRAME_S * street_of(seed, theme).speed_m_s, rel=0.12)  # bends are shorter inside
     turned = [np.linalg.norm(one[:3, :3] - two[:3, :3]) for one, two in pairwise(way)]
     assert max(turned) < 0.1
 
@@ -171,7 +172,7 @@ def test_poses_are_those_of_the_scans_and_our_car_keeps_its_speed():
 def test_short_drives_end_and_long_ones_see_what_lies_ahead():
     seed, theme = DRIVES[0]
     last = frames_before_end(seed, theme) - 1
-    scene = scene_of(seed, theme)
+    scene = street_of(seed, theme)
     assert 99 < scene.speed_m_s * FRAME_S * (last + 1) + 1 > 100 >= scene.speed_m_s * FRAME_S * last
     short, as_short, long = (scan_of(seed, theme, last, frames=frames) for frames in (1, last + 1, last + 2))
     assert same_points(short, as_short)
@@ -179,7 +180,7 @@ def test_short_drives_end_and_long_ones_see_what_lies_ahead():
     assert ahead[1] > ahead[0] + 20
     begins = [scan_of(seed, theme, 0, frames=frames).points_xyz_m for frames in (1, FRAMES)]
     assert len(begins[0]) == pytest.approx(len(begins[1]), rel=0.01)
-    parked = next(seed for seed in range(40) if scene_of(seed).speed_m_s == 0)
+    parked = next(seed for seed in range(40) if street_of(seed).speed_m_s == 0)
     assert frames_before_end(parked) == FRAMES
     with pytest.raises(ConfigError, match="the frame 100000; wanted a frame from 0 to 99999"):
         scan_of(seed, theme, 0, frames=FRAMES + 1)

@@ -17,6 +17,7 @@ from lidargrit.simulator.scene.plan_sampling import sample_street_plan
 from lidargrit.simulator.scene.settlement import lay_out_houses
 from lidargrit.simulator.scene.vehicles import make_vehicles, vehicle_shape
 from lidargrit.simulator.tracing import objects_in_reach
+from whole_streets import mesh_of, mesh_of_objects
 
 THEMES = ("city", "suburb", "country")
 SEEDS = range(8)
@@ -46,11 +47,11 @@ def test_one_state_one_scene(theme):
     np.random.seed(2)  # noqa: NPY002
     two = sample_scene(np.random.default_rng(7), theme)
     for time_s in (0.0, 0.7):
-        first, second = one.mesh(time_s), two.mesh(time_s)
+        first, second = mesh_of(one, time_s), mesh_of(two, time_s)
         for field in FIELDS:
             assert np.array_equal(getattr(first, field), getattr(second, field)), field
         assert np.array_equal(one.sensor_pose(time_s), two.sensor_pose(time_s))
-    assert len(sample_scene(np.random.default_rng(8), theme).mesh()) != len(one.mesh())
+    assert len(mesh_of(sample_scene(np.random.default_rng(8), theme))) != len(mesh_of(one))
 
 
 def test_mixed_draws_mostly_streets_with_houses():
@@ -66,7 +67,7 @@ def test_unknown_theme_is_refused():
 
 
 def test_triangles_are_sound(scenes, meshes):
-    for mesh in (*meshes.values(), *(scenes[theme, 0].mesh() for theme in THEMES)):
+    for mesh in (*meshes.values(), *(mesh_of(scenes[theme, 0]) for theme in THEMES)):
         assert np.isfinite(mesh.triangles_m).all()
         sides = mesh.triangles_m[:, 1:] - mesh.triangles_m[:, :1]
         area = np.linalg.norm(np.cross(sides[:, 0].astype(float), sides[:, 1].astype(float)), axis=1) / 2
@@ -104,7 +105,7 @@ def test_nothing_stands_in_our_own_car(scenes, time_s):
         pose = scene.sensor_pose(time_s)
         near_us = objects_in_reach(scene.objects(time_s), [pose], range_max_m=5.0)
         to_sensor = np.linalg.inv(pose)
-        for mesh in (scene.standing, near_us.mesh()):
+        for mesh in (scene.standing, mesh_of_objects(near_us)):
             local = mesh.triangles_m @ to_sensor[:3, :3].T.astype(np.float32) + to_sensor[:3, 3].astype(np.float32)
             apart = (local.max(axis=1) < low) | (local.min(axis=1) > high)  # by their own boxes: stricter than need be
             near = ~apart.any(axis=1)
@@ -245,7 +246,7 @@ def test_objects_stretch_and_colour_their_shapes():
     plan = sample_street_plan(np.random.default_rng(0), "city")
     batch = make_vehicles(np.random.default_rng(3), np.array([0, 8]), placements, 5)
     objects = batch.at(plan)
-    mesh, finish = objects.mesh(), objects.finish()
+    mesh, finish = mesh_of_objects(objects), objects.finish()
     assert len(mesh) == sum(len(s) for s in objects.shapes)
     assert len(finish) == sum(len(s.material) for s in objects.shapes)
     assert set(np.unique(mesh.instance)) == {5, 6}
@@ -278,7 +279,7 @@ def test_backdrop_leaves_little_bare_sky(scenes):
     for (theme, seed), scene in scenes.items():
         if seed > 3:
             continue
-        corner = scene.mesh().triangles_m.reshape(-1, 3)
+        corner = mesh_of(scene).triangles_m.reshape(-1, 3)
         flat = np.hypot(corner[:, 0], corner[:, 1])
         high = corner[(corner[:, 2] - SENSOR_HEIGHT_M) > np.tan(np.radians(2.6)) * flat]
         sector = ((np.arctan2(high[:, 1], high[:, 0]) + np.pi) / (2 * np.pi) * 120).astype(int)

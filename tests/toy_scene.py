@@ -39,8 +39,6 @@ def wall(x_m, albedo=0.4, material=materials.PLASTER, half_width_m=40.0):
 class ToyScene:
     """Mounted where KITTI's sensor is; may drive ahead and turn left."""
 
-    theme = "city"
-
     def __init__(self, *parts, speed_m_s=0.0, turn_rad_s=0.0):
         self.standing, self.speed_m_s, self.turn_rad_s = Mesh.join(parts), speed_m_s, turn_rad_s
 

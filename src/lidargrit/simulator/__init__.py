@@ -29,7 +29,6 @@ __all__ = [
     "frames_before_end",
     "observe",
     "poses_of",
-    "scene_of",
     "simulate",
 ]
 
@@ -146,15 +145,6 @@ def _street(seed: int, theme: Theme) -> tuple[Scene, np.random.Generator]:
 def _road(seed: int, theme: Theme) -> LongRoad:
     """Return the street of a seed that goes on."""
     return LongRoad(seed, theme)
-
-
-def scene_of(seed: int, theme: Theme = "mixed") -> Scene:
-    """Return the street of a seed, which :func:`simulate` scans: its triangles, and the path of the car.
-
-    It is the street that ends; further stretches of a longer drive are not part of it.
-    """
-    check_settings(seed, theme)
-    return _street(seed, theme)[0]
 
 
 def poses_of(

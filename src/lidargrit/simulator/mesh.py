@@ -153,13 +153,3 @@ class Objects:
         material = [shape.material for shape in self.shapes]
         instance = np.repeat(self.instance, [len(parts) for parts in material])
         return Finish(np.concatenate(material), np.concatenate(self.albedo), np.concatenate(self.label), instance)
-
-    def mesh(self) -> Mesh:
-        """Return all their triangles in the scene's frame, object after object."""
-        finish, moved, part = self.finish(), [np.zeros((0, 3, 3))], [np.zeros(0, np.int64)]
-        for shape, frame, first in zip(self.shapes, self.frame, self.first_part(), strict=True):
-            moved.append(shape.triangles_m @ frame[:3, :3].T + frame[:3, 3])
-            part.append(first + shape.part)
-        every, triangles_m = np.concatenate(part), np.concatenate(moved).astype(np.float32)
-        material, albedo, label = finish.material[every], finish.albedo[every], finish.label[every]
-        return Mesh(material, albedo, label, finish.instance[every], triangles_m)

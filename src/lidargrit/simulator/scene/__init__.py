@@ -29,7 +29,6 @@ class Scene:
     further stretch of a road is moved by ``plan.offset_m``, so that coordinates stay small.
 
     Args:
-        theme: kind of street: city, suburb or country.
         plan: layout of the roads and the ground.
         standing: triangles that are of this street alone: its ground, its houses, its walls and fences.
         still: kept objects that never move.
@@ -38,7 +37,6 @@ class Scene:
         begins_s: time of the drive at which our car is where u is 0.
     """
 
-    theme: str
     plan: StreetPlan
     standing: Mesh
     still: Objects
@@ -54,10 +52,6 @@ class Scene:
     def objects(self, time_s: float = 0.0) -> Objects:
         """Return the kept objects at a time, in seconds."""
         return Objects.join([self.still, *(batch.at(self.plan, time_s - self.begins_s) for batch in self.moving)])
-
-    def mesh(self, time_s: float = 0.0) -> Mesh:
-        """Return all triangles at a time, in seconds, those of kept objects too."""
-        return Mesh.join([self.standing, self.objects(time_s).mesh()])
 
     def sensor_pose(self, time_s: float = 0.0, height_m: float = SENSOR_HEIGHT_M) -> Float64[np.ndarray, "4 4"]:
         """Return the transform from the sensor's frame to the world at a time; our car keeps to its lane.
@@ -98,7 +92,7 @@ def sample_scene(rng: np.random.Generator, theme: Theme = "mixed") -> Scene:
         raise ConfigError(f"the theme {theme!r}", f"one of {', '.join(get_args(Theme))}", "choose one of these")
     plan = sample_street_plan(rng, theme)
     parts = lay_out_first(rng, plan)
-    return Scene(plan.theme, plan, parts.standing, parts.still, parts.moving, sample_attitude(rng))
+    return Scene(plan, parts.standing, parts.still, parts.moving, sample_attitude(rng))
 
 
 def sample_attitude(rng: np.random.Generator) -> Float64[np.ndarray, "3"]:

@@ -89,7 +89,7 @@ class LongRoad:
     def _scene_of(self, number: int, standing: Mesh, still: Objects, moving: tuple[ObjectBatch, ...]) -> Scene:
         begins_s = _middle_m(number) / self._plan.speed_m_s
         plan = self._plan_of(number)
-        return Scene(plan.theme, plan, standing, still, moving, self._attitude_rad, begins_s)
+        return Scene(plan, standing, still, moving, self._attitude_rad, begins_s)
 
     def _around(self, number: int) -> Scene:
         numbers = range(max(number - 1, 0), number + 2)
