@@ -7,7 +7,7 @@ import pytest
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.scans import classes
-from lidargrit.simulator import materials
+from lidargrit.simulator import materials, simulate
 from lidargrit.simulator.mesh import Finish
 from lidargrit.simulator.scene import SENSOR_HEIGHT_M, sample_scene
 from lidargrit.simulator.scene.body_types import BODY_TYPES
@@ -63,7 +63,7 @@ def test_mixed_draws_mostly_streets_with_houses():
 
 def test_unknown_theme_is_refused():
     with pytest.raises(ConfigError, match="the theme 'village'; wanted one of city"):
-        inspect.unwrap(sample_scene)(np.random.default_rng(0), "village")
+        inspect.unwrap(simulate)(0, theme="village")
 
 
 def test_triangles_are_sound(scenes, meshes):
