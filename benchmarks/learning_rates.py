@@ -14,9 +14,9 @@ from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import TrainingError
 from lidargrit.data.run_folder import is_run
-from lidargrit.evaluation.benchmark import Benchmark, as_table
-from lidargrit.evaluation.benchmark import run as run_benchmark
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.compare import Benchmark, as_table
+from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.generation.presets import load_preset
 from lidargrit.training import check_folder, train, training_flops, with_budget
 

@@ -20,7 +20,7 @@ from lidargrit.core import discovery
 from lidargrit.data.datasets import load
 from lidargrit.data.formats import read_scan as read_bin
 from lidargrit.data.sources.samples import read_samples
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.scorecard import format_value
 from lidargrit.generation.presets import load_preset
 from tiny_runs import MODEL, the_one_line

@@ -6,16 +6,16 @@ from dataclasses import replace
 import torch
 
 from lidargrit.data.images import RangeImages
-from lidargrit.evaluation import benchmark
-from lidargrit.evaluation.benchmark import run as run_benchmark
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation import compare
+from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.scans.sensors import load_sensor
 from seeded_images import SeededImages
 from seeded_networks import weights
-from test_benchmark import BENCHMARK
+from test_compare import BENCHMARK
 
 SENSOR = load_sensor("vlp16").with_columns(32)
 
@@ -30,7 +30,7 @@ def test_scores_are_computed_again_with_weights_that_came_since(tmp_path, heard)
 
     def scored():
         heard.clear()
-        benchmark._score(pair, settings, path)
+        compare._score(pair, settings, path)
         there = json.loads(path.read_text())
         return there["scores"], there["left_out"], any("are there already" in line for line in heard)
 
@@ -71,6 +71,6 @@ def test_it_is_told_which_limit_held(tmp_path, monkeypatch, heard):
 
     assert "simulated:6:test has 6 scans" in told("reference", reference="simulated:6:test")
     few = replace(load_protocol("exact"), num_scans=4)
-    for module in ("benchmark.load_protocol", "comparison.load_protocol"):
+    for module in ("compare.load_protocol", "evaluate.load_protocol"):
         monkeypatch.setattr(f"lidargrit.evaluation.{module}", lambda name: few)
     assert "protocol exact takes 4 scans" in told("protocol")

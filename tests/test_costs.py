@@ -7,10 +7,10 @@ import pytest
 
 from lidargrit.core.errors import CheckpointError
 from lidargrit.evaluation import costs
-from lidargrit.evaluation.benchmark import as_table
-from lidargrit.evaluation.benchmark import run as run_benchmark
+from lidargrit.evaluation.compare import as_table
+from lidargrit.evaluation.compare import run as run_benchmark
 from lidargrit.evaluation.costs import COSTS, Costs
-from test_benchmark import BENCHMARK
+from test_compare import BENCHMARK
 from test_generator_contract import made
 
 

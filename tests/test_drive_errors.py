@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.drives import DriveConfig, write_drives
-from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.drive_errors import (
     chamfer_m2,
     consistency_chamfer_m2,
@@ -22,6 +21,7 @@ from lidargrit.evaluation.drive_errors import (
     registered,
 )
 from lidargrit.evaluation.drives import baselines, constant_speed, evaluate_forecast
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
 

@@ -17,7 +17,7 @@ from lidargrit.core.table import render
 from lidargrit.data.images import Pixels, Provenance
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.data.sources import open_source
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources, read_config
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources, read_config
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import pair_for_protocol
@@ -72,7 +72,7 @@ def sets(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def card(sets):
-    return compare_sources(*sets, EvalConfig(metrics=CHEAP))[0]
+    return evaluate_sources(*sets, EvalConfig(metrics=CHEAP))[0]
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)
@@ -129,7 +129,7 @@ def test_a_scorecard_tells_all_that_is_needed_to_repeat_it(card):
 
 
 def test_the_same_again_gives_the_same(card, sets):
-    again = compare_sources(*sets, EvalConfig(metrics=CHEAP))[0]
+    again = evaluate_sources(*sets, EvalConfig(metrics=CHEAP))[0]
     without = [replace(score, seconds=0.0) for score in card.scores]
     assert [replace(score, seconds=0.0) for score in again.scores] == without
     assert again.samples == card.samples
@@ -137,7 +137,7 @@ def test_the_same_again_gives_the_same(card, sets):
 
 
 def test_no_intervals_where_none_are_wanted(card, sets):
-    plain = compare_sources(*sets, EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0)))[0]
+    plain = evaluate_sources(*sets, EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0)))[0]
     assert all(score.interval is None and score.real_against_real is None for score in plain.scores)
     assert [s.result.value for s in plain.scores] == pytest.approx([s.result.value for s in card.scores])
     assert "0.0" in plain.as_table()
@@ -149,7 +149,7 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
     settings = EvalConfig(
         metrics=(*CHEAP, "frechet_pointcloud_distance"), weights={"pointnet": missing}, resampling=Resampling(halves=0)
     )
-    card = compare_sources(*sets, settings)[0]
+    card = evaluate_sources(*sets, settings)[0]
     assert [score.result.metric for score in card.scores] == list(CHEAP)
     assert {each.metric for each in card.left_out} == {"frechet_pointcloud_distance"}
     assert "none.pth" in card.left_out[0].why
@@ -158,7 +158,7 @@ def test_a_metric_that_cannot_be_had_leaves_the_others(monkeypatch, tmp_path, se
     write_json(tmp_path / "mine.json", card.to_json())
     assert "mine: left out: frechet_pointcloud_distance" in render(side_by_side([tmp_path / "mine.json"]))
     with pytest.raises(LidarGritError, match=r"none\.pth"):
-        compare_sources(*sets, replace(settings, metrics=("frechet_pointcloud_distance",)))
+        evaluate_sources(*sets, replace(settings, metrics=("frechet_pointcloud_distance",)))
 
 
 def test_what_is_not_as_the_protocol_wants_is_told():
@@ -232,16 +232,18 @@ def test_files_of_one_name_are_told_apart_and_rows_complete_each_other(card, tmp
 def test_sets_that_overlap_and_projections_that_differ_are_told(sets, tmp_path):
     plain = EvalConfig(metrics=CHEAP, resampling=Resampling(halves=0))
     samples = write_scans(tmp_path / "samples", 3, 7, variant="exact")
-    twice, _ = compare_sources(samples, samples, plain)
+    twice, _ = evaluate_sources(samples, samples, plain)
     assert "overlap (3 scans are in both)" in twice.leak
     assert any("overlap (3 scans are in both)" in sentence for sentence in twice.verdict.sentences)
-    assert "the order is SAMPLES REFERENCE" in " ".join(compare_sources("simulated:3:test", samples, plain)[0].warnings)
-    same, _ = compare_sources(sets[0], sets[0], plain)
+    assert "the order is SAMPLES REFERENCE" in " ".join(
+        evaluate_sources("simulated:3:test", samples, plain)[0].warnings
+    )
+    same, _ = evaluate_sources(sets[0], sets[0], plain)
     assert "overlap (12 scans are in both)" in same.leak
     assert [score.result.value for score in same.scores] == [0.0, 0.0]
     ours = [write_scans(tmp_path / name, 4, 5, variant=name) for name in ("exact", "reference")]
     for samples, differs in zip(ours, (True, False), strict=True):
-        card, pair = compare_sources(samples, sets[1], plain)
+        card, pair = evaluate_sources(samples, sets[1], plain)
         assert any("projections differ" in warning for warning in card.warnings) == differs
         assert pair.samples.record().projection == f"unfolding, {'exact' if differs else 'reference'}"
 

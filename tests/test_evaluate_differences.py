@@ -12,7 +12,7 @@ from lidargrit.core.table import render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair, compare_sources
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair, evaluate_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet, deviations
 from lidargrit.evaluation.protocols import load_protocol
@@ -57,7 +57,7 @@ def test_images_that_were_made_in_another_way_are_told(pair, told):
 def test_other_definitions_are_told_and_have_no_published_scores_beside_them(tmp_path):
     def scored(**settings):
         settings = EvalConfig("lidargrit-kitti-odometry", resampling=PLAIN, **settings)
-        card = compare_pair(as_wanted(), settings)
+        card = evaluate_pair(as_wanted(), settings)
         write_json(tmp_path / "ours.json", card.to_json())
         return card.deviations, render(side_by_side([tmp_path / "ours.json"]))
 
@@ -67,7 +67,7 @@ def test_other_definitions_are_told_and_have_no_published_scores_beside_them(tmp
     told, table = scored(metrics=("sliced_wasserstein",), variant="textbook")
     assert told == ("sliced_wasserstein is computed by the definition textbook, not by reference",)
     assert "DUSty" not in table
-    every = compare_pair(as_wanted(), EvalConfig(metrics=("sliced_wasserstein",), resampling=PLAIN))
+    every = evaluate_pair(as_wanted(), EvalConfig(metrics=("sliced_wasserstein",), resampling=PLAIN))
     assert len(every.scores) == 2
     assert every.deviations == (), "the protocol's own is among them"
 
@@ -76,16 +76,16 @@ def test_columns_without_a_sensor_are_those_of_prepared_scans(tmp_path):
     wide = DataConfig(columns=256, workers=1)
     names = [str(prepare(f"simulated:2:{split}", wide, tmp_path / split)) for split in ("train", "test")]
     settings = EvalConfig(metrics=("return_rate_per_ring",), resampling=PLAIN, data=DataConfig(columns=128, workers=1))
-    card, pair = compare_sources(*names, settings)
+    card, pair = evaluate_sources(*names, settings)
     assert pair.samples.images.sensor.width == pair.reference.images.sensor.width == 128
     assert (card.settings["columns"], card.settings["column_stride"]) == (128, 1)
-    card, pair = compare_sources(*names, replace(settings, data=DataConfig(workers=1)))
+    card, pair = evaluate_sources(*names, replace(settings, data=DataConfig(workers=1)))
     assert pair.samples.images.sensor.width == 256
     assert not {"columns", "column_stride"} & card.settings.keys()
     with pytest.raises(DataError, match=r"64x256.*; wanted the rays of .*64x512"):
-        compare_sources(*names, replace(settings, data=DataConfig(columns=512, workers=1)))
+        evaluate_sources(*names, replace(settings, data=DataConfig(columns=512, workers=1)))
     with pytest.raises(DataError, match=r"prepared by the projection exact, unfolding, .* wanted exact, spherical"):
-        compare_sources(*names, replace(settings, data=DataConfig(projection="spherical", workers=1)))
+        evaluate_sources(*names, replace(settings, data=DataConfig(projection="spherical", workers=1)))
 
 
 def test_columns_without_a_sensor_are_those_of_range_images(tmp_path):
@@ -95,7 +95,7 @@ def test_columns_without_a_sensor_are_those_of_range_images(tmp_path):
             np.save(tmp_path / name / f"{index}.npy", SeededImages(ODOMETRY, 2).read(index).range_m)
     settings = EvalConfig(metrics=("return_rate_per_ring",), resampling=PLAIN, data=DataConfig(columns=128))
     with pytest.raises(ScanError, match="a range image of 64x256; wanted 64x128"):
-        compare_sources(str(tmp_path / "a"), str(tmp_path / "b"), settings)
+        evaluate_sources(str(tmp_path / "a"), str(tmp_path / "b"), settings)
 
 
 def test_errors_of_reconstruction_are_no_row_of_a_table(tmp_path):

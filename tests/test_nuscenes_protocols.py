@@ -11,7 +11,7 @@ import lidargrit
 from lidargrit.data import formats
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.sample_formats import load_sample_format, read_tensor_folder
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import grid_of_points_m
 from lidargrit.evaluation.protocols import load_protocol
@@ -100,9 +100,9 @@ def test_of_clouds_the_first_26000_points_alone_are_scored(tmp_path):
     settings = EvalConfig("lidarcrafter", ("bev_jsd",), resampling=Resampling(halves=0), data=DataConfig(workers=1))
     sets = [str(tmp_path / name) for name in ("samples", "real")]
     wanted = divergence_root(*sums)
-    card, _ = compare_sources(*sets, settings)
+    card, _ = evaluate_sources(*sets, settings)
     assert any("the first 26,000 points alone" in warning for warning in card.warnings)
-    assert "both have scans of" in compare_sources(sets[0], sets[0], settings)[0].leak
+    assert "both have scans of" in evaluate_sources(sets[0], sets[0], settings)[0].leak
     assert card.scores[0].result.value == pytest.approx(wanted, abs=2e-4), "prepared ranges are rounded to 2 mm"
     in_memory = lidargrit.evaluate(
         read["samples"], read["real"], "lidarcrafter", ["bev_jsd"], sensor=load_sensor("hdl32e_nuscenes")
@@ -177,7 +177,7 @@ def test_samples_of_opendwm_are_turned_have_no_rings_and_are_told_to_be_voxels(t
         xyz, laser = street(number)
         rows = np.column_stack((-xyz[:, 1], xyz[:, 0], xyz[:, 2], np.ones(len(xyz)), 31 - laser))
         rows.astype(np.float32).tofile(tmp_path / "real" / f"{number}.pcd.bin")
-    card, _ = compare_sources(str(tmp_path / "nuscenes"), str(tmp_path / "real"), settings)
+    card, _ = evaluate_sources(str(tmp_path / "nuscenes"), str(tmp_path / "real"), settings)
     assert sum("lie on a grid of 0.125 m: voxels, not" in warning for warning in card.warnings) == 1
     assert card.samples.projection.startswith("spherical")
     assert card.reference.projection.startswith("spherical"), "both by elevation, since one has no rings"
@@ -194,7 +194,7 @@ def test_centres_of_voxels_are_told_beside_the_score(tmp_path):
         for number in range(2):
             np.savez(tmp_path / name / f"{number}.npz", points)
     settings = EvalConfig("lidarcrafter", ("bev_jsd",), resampling=Resampling(halves=0), data=DataConfig(workers=1))
-    told = compare_sources(str(tmp_path / "voxels"), str(tmp_path / "clouds"), settings)[0].warnings
+    told = evaluate_sources(str(tmp_path / "voxels"), str(tmp_path / "clouds"), settings)[0].warnings
     assert sum("lie on a grid of 0.2 m: voxels, not" in warning for warning in told) == 1
-    same = compare_sources(str(tmp_path / "clouds"), str(tmp_path / "clouds"), settings)[0].warnings
+    same = evaluate_sources(str(tmp_path / "clouds"), str(tmp_path / "clouds"), settings)[0].warnings
     assert not any("voxels, not" in warning for warning in same)

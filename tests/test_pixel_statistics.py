@@ -8,7 +8,7 @@ from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.evaluation import scoring as module
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.scoring import pixel_statistics
@@ -68,7 +68,7 @@ def test_where_pixels_are_independent_they_score_like_real_scans():
     config = EvalConfig(metrics=metrics, resampling=Resampling(halves=4), pixel_statistics=True)
     ratios = []
     for seed in range(4):
-        for score in compare_pair(pair_of(16, seed), config).scores:
+        for score in evaluate_pair(pair_of(16, seed), config).scores:
             assert score.real_against_real is not None
             assert score.pixel_statistics is not None
             if score.result.metric in ("range_histogram_per_ring", "bev_jsd") and score.result.variant == "exact":
@@ -81,7 +81,7 @@ def test_they_know_no_scan_that_they_are_compared_with_and_no_shape():
     pair = EvalPair(EvalSet("a", real, range(12)), EvalSet("b", real, range(12, 24)))
     metrics = ("range_histogram_per_ring", "return_rate_by_incidence")
     config = EvalConfig(metrics=metrics, resampling=Resampling(groups=12, halves=2), pixel_statistics=True)
-    rows, incidence = compare_pair(pair, config).scores
+    rows, incidence = evaluate_pair(pair, config).scores
     assert rows.real_against_real is not None
     assert incidence.real_against_real is not None
     assert rows.pixel_statistics == pytest.approx(rows.real_against_real.value, rel=0.15)
@@ -90,6 +90,6 @@ def test_they_know_no_scan_that_they_are_compared_with_and_no_shape():
 
 def test_too_few_scans_are_told():
     config = EvalConfig(metrics=("bev_jsd",), variant="exact", pixel_statistics=True)
-    card = compare_pair(pair_of(3), config)
+    card = evaluate_pair(pair_of(3), config)
     assert [score.pixel_statistics for score in card.scores] == [None]
     assert "too few scans for pixel statistics of bev_jsd" in card.warnings

@@ -22,7 +22,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import phases_of
 from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.vqvae import Vqvae
-from lidargrit.nn.processes import of_first_process
+from lidargrit.nn.collectives import of_first_process
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage

@@ -15,7 +15,7 @@ from lidargrit.core.arrays import read_arrays
 from lidargrit.core.errors import ConfigError, DataError, LidarGritError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.evaluation import reference_file as module
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources, save_reference
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources, save_reference
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
 from lidargrit.evaluation.metrics.shared.networks.frechet import Moments, frechet_distance
@@ -41,8 +41,8 @@ def told(card):
 
 
 def test_scores_are_equal_with_and_without_the_file(path):
-    with_file, _ = compare_sources(SAMPLES, str(path), SETTINGS)
-    without, _ = compare_sources(SAMPLES, REAL, SETTINGS)
+    with_file, _ = evaluate_sources(SAMPLES, str(path), SETTINGS)
+    without, _ = evaluate_sources(SAMPLES, REAL, SETTINGS)
     assert told(with_file) == told(without)
     assert {score.result.metric for score in without.scores} == set(METRICS)
     assert all(score.interval and score.real_against_real and score.pixel_statistics for score in without.scores)
@@ -52,7 +52,7 @@ def test_scores_are_equal_with_and_without_the_file(path):
 
 def test_the_file_knows_scans_that_the_samples_repeat(path):
     settings = dataclasses.replace(SETTINGS, metrics=("bev_jsd",), pixel_statistics=False)
-    assert "8 scans are in both" in compare_sources(REAL, str(path), settings)[0].leak
+    assert "8 scans are in both" in evaluate_sources(REAL, str(path), settings)[0].leak
 
 
 def test_moments_are_restored_bit_for_bit():
@@ -84,7 +84,7 @@ def test_the_file_holds_sums_and_no_scan(path, monkeypatch, tmp_path):
     with path.open("rb") as file:
         names = tuple(part.arrays["total"] for part in jsd.real)
         total = np.sum([*read_arrays(file, names).values()])
-    card, pair = compare_sources(SAMPLES, REAL, dataclasses.replace(PLAIN, metrics=("bev_jsd",), variant="exact"))
+    card, pair = evaluate_sources(SAMPLES, REAL, dataclasses.replace(PLAIN, metrics=("bev_jsd",), variant="exact"))
     assert card.reference.scans_used == 8
     points = 0
     for image in pair.reference.batch(range(8)):  # an independent count, ray by ray
@@ -98,7 +98,7 @@ def test_the_file_holds_sums_and_no_scan(path, monkeypatch, tmp_path):
     small = save_reference(REAL, tmp_path / "small.lgref", PLAIN)
     missing = [each.metric for each in small.contents.metrics if each.why_not]
     assert "sliced_wasserstein" in missing
-    left_out = compare_sources(SAMPLES, str(small.path), PLAIN)[0].left_out
+    left_out = evaluate_sources(SAMPLES, str(small.path), PLAIN)[0].left_out
     assert [each.metric for each in left_out] == missing
     assert "more than 0 (--metrics sliced_wasserstein keeps all)" in left_out[0].why
 
@@ -114,13 +114,13 @@ def test_the_file_holds_sums_and_no_scan(path, monkeypatch, tmp_path):
 )
 def test_other_settings_than_those_of_the_file_are_refused(path, samples, change, line):
     with pytest.raises(ConfigError) as refused:
-        compare_sources(samples, str(path), dataclasses.replace(SETTINGS, **change))
+        evaluate_sources(samples, str(path), dataclasses.replace(SETTINGS, **change))
     assert line.format(path) in str(refused.value)
 
 
 def test_metrics_that_the_file_lacks_are_named(path):
     settings = dataclasses.replace(SETTINGS, metrics=("bev_jsd", "flying_points"))
-    card, _ = compare_sources(SAMPLES, str(path), settings)
+    card, _ = evaluate_sources(SAMPLES, str(path), settings)
     (left_out,) = [each for each in card.left_out if each.metric == "flying_points"]
     assert "holds nothing for flying_points (exact): it was made without this metric" in left_out.why
 
@@ -136,8 +136,8 @@ def rewritten(path, out, change):
 
 
 def test_damaged_and_altered_files_are_refused_in_one_line(path, tmp_path, capsys):
-    assert told(compare_sources(SAMPLES, str(rewritten(path, tmp_path / "same.lgref", dict)), SETTINGS)[0]) == told(
-        compare_sources(SAMPLES, str(path), SETTINGS)[0]
+    assert told(evaluate_sources(SAMPLES, str(rewritten(path, tmp_path / "same.lgref", dict)), SETTINGS)[0]) == told(
+        evaluate_sources(SAMPLES, str(path), SETTINGS)[0]
     )
     data = path.read_bytes()
     (tmp_path / "short.lgref").write_bytes(data[: len(data) // 2])
@@ -203,8 +203,8 @@ def test_features_through_other_weights_are_not_compared(tmp_path):
     settings = dataclasses.replace(PLAIN, metrics=("frechet_pointcloud_distance", "bev_jsd"), variant="exact")
     first, other = (dataclasses.replace(settings, weights={"pointnet": file}) for file in files.values())
     made = str(save_reference(REAL, tmp_path / "features.lgref", first).path)
-    assert told(compare_sources(SAMPLES, made, first)[0]) == told(compare_sources(SAMPLES, REAL, first)[0])
-    (left_out,) = compare_sources(SAMPLES, made, other)[0].left_out
+    assert told(evaluate_sources(SAMPLES, made, first)[0]) == told(evaluate_sources(SAMPLES, REAL, first)[0])
+    (left_out,) = evaluate_sources(SAMPLES, made, other)[0].left_out
     assert "and a reference that was made by" in left_out.why
 
 
@@ -215,8 +215,8 @@ def test_fewer_samples_and_samples_of_other_rays_are_refused(path, tmp_path):
         for number in range(count):
             np.save(tmp_path / name / f"{number}.npy", np.ones((64, columns), np.float32))
         with pytest.raises(LidarGritError, match=lines[name]):
-            compare_sources(str(tmp_path / name), str(path), SETTINGS)
+            evaluate_sources(str(tmp_path / name), str(path), SETTINGS)
     (tmp_path / "r2dm").mkdir()
     torch.save(torch.ones(5, 64, 1024), tmp_path / "r2dm" / "samples_0000000.pth")
     with pytest.raises(ConfigError, match=r"\(64x1024, column stride 1\), and .* scans as .*; have a file made with"):
-        compare_sources(str(tmp_path / "r2dm"), str(path), dataclasses.replace(SETTINGS, data=DataConfig(workers=1)))
+        evaluate_sources(str(tmp_path / "r2dm"), str(path), dataclasses.replace(SETTINGS, data=DataConfig(workers=1)))

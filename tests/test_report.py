@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lidargrit.evaluation import profiles
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
 from lidargrit.evaluation.profiles import matches, profile, searched_scans
 from lidargrit.evaluation.scorecard import LeftOut
@@ -27,7 +27,7 @@ EVIL = "<script>alert('x')</script>\"'&"
 @pytest.fixture(scope="module")
 def evaluated():
     # Of real streets only a few: simulating them takes most of the time.
-    return compare_sources("simulated:4:train", "simulated:4:test", EvalConfig(metrics=("return_rate_per_ring",)))
+    return evaluate_sources("simulated:4:train", "simulated:4:test", EvalConfig(metrics=("return_rate_per_ring",)))
 
 
 class Reader(HTMLParser):

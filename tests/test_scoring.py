@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.core.errors import ConfigError, LidarGritError, UnknownNameError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork

@@ -24,8 +24,8 @@ from lidargrit.data.sources import (
     open_source,
 )
 from lidargrit.data.sources.image_files import ImageFileSource
-from lidargrit.evaluation.benchmark import Benchmark
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.compare import Benchmark
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.inference.samples import write_samples
 from lidargrit.scans.sensors import load_sensor
@@ -117,7 +117,7 @@ def test_two_prepared_folders_are_opened_once_each(folders, monkeypatch):
 
     monkeypatch.setattr(PreparedImages, "__init__", counted)
     quick = EvalConfig(metrics=("return_rate_per_ring",), resampling=Resampling(halves=0), data=ONE)
-    card, pair = compare_sources(str(folders / "train"), str(folders / "test"), quick)
+    card, pair = evaluate_sources(str(folders / "train"), str(folders / "test"), quick)
     assert opened == {"train": 1, "test": 1}
     assert (card.samples.split, card.reference.split) == ("train", "test")
     assert len(pair.samples) == 4

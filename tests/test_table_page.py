@@ -1,7 +1,7 @@
 """The page of a comparison: what it says of real against real, how it counts, and which folders it does not name."""
 
 from lidargrit.viewer.table_page import table_page
-from test_benchmark import cell_of
+from test_compare import cell_of
 
 
 def test_a_reader_learns_what_real_against_real_is_and_of_how_many_scans():

@@ -12,7 +12,7 @@ from lidargrit.core.files import write_json
 from lidargrit.core.table import render
 from lidargrit.data.images import Provenance
 from lidargrit.data.sources.samples import MANIFEST, read_facts
-from lidargrit.evaluation.comparison import EvalConfig, compare_sources
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.scorecard import NOT_APPLICABLE, Scorecard
 from lidargrit.evaluation.tables import side_by_side
@@ -45,7 +45,7 @@ def sets(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def compared(sets):
-    return compare_sources(str(sets / "lidargan"), str(sets / "dusty"), SETTINGS)
+    return evaluate_sources(str(sets / "lidargan"), str(sets / "dusty"), SETTINGS)
 
 
 def test_samples_tell_which_rows_are_full(sets):
@@ -73,7 +73,7 @@ def test_the_scorecard_says_so_in_words(compared, tmp_path):
 
 
 def test_it_does_not_matter_which_set_has_no_raydrop(sets):
-    card, _ = compare_sources(str(sets / "dusty"), str(sets / "lidargan"), SETTINGS)
+    card, _ = evaluate_sources(str(sets / "dusty"), str(sets / "lidargan"), SETTINGS)
     assert {each.metric for each in card.left_out} == set(RAYDROP)
 
 
@@ -86,7 +86,7 @@ def test_metrics_of_raydrop_alone_give_a_table_and_no_error(sets, capsys):
 
 def test_tables_and_pages_say_so_too(compared, sets, tmp_path):
     card, pair = compared
-    other, _ = compare_sources(str(sets / "dusty"), str(sets / "dusty"), SETTINGS)
+    other, _ = evaluate_sources(str(sets / "dusty"), str(sets / "dusty"), SETTINGS)
     write_json(tmp_path / "lidargan.json", card.to_json())
     write_json(tmp_path / "dusty.json", replace(other, reference=card.reference).to_json())
     for order in (("lidargan", "dusty"), ("dusty", "lidargan"), ("lidargan",)):

@@ -16,7 +16,7 @@ from lidargrit.data.run_folder import PACKAGED
 from lidargrit.data.sources import Source, open_source
 from lidargrit.data.sources.memory import MemorySource
 from lidargrit.data.torch_dataset import TorchDataset
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair, open_pair, open_reference
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair, open_pair, open_reference
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.generation.generator import load
 from lidargrit.inference.complete import Model, open_model
@@ -201,7 +201,7 @@ def evaluate(
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
     real = open_reference(reference, settings) if isinstance(reference, str) else _source(reference, sensor)
-    return compare_pair(open_pair(_source(generated, sensor), real, settings), settings)
+    return evaluate_pair(open_pair(_source(generated, sensor), real, settings), settings)
 
 
 def _as_scan(points: Points) -> Scan:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings, scan_words
 
 if TYPE_CHECKING:
-    from lidargrit.evaluation.benchmark import Benchmark
+    from lidargrit.evaluation.compare import Benchmark
     from lidargrit.evaluation.reproduction import Reproduction
 
 COMPLETION, COMPLETED = "completion", "completion.json"
@@ -31,7 +31,7 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
     The same command goes on, but for completions, which begin anew.
     """
     from lidargrit.core.files import write_text
-    from lidargrit.evaluation.benchmark import as_json, as_table, run
+    from lidargrit.evaluation.compare import as_json, as_table, run
     from lidargrit.evaluation.reproduction import plan, plan_as_text, prepare
     from lidargrit.evaluation.table_folder import write_table
     from lidargrit.viewer.table_page import table_page
@@ -56,8 +56,8 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
 def _systems(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
     from lidargrit.core.errors import ConfigError
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.evaluation.benchmark import Benchmark
-    from lidargrit.evaluation.comparison import EvalConfig
+    from lidargrit.evaluation.compare import Benchmark
+    from lidargrit.evaluation.evaluate import EvalConfig
     from lidargrit.evaluation.table_folder import read_table
 
     refuse_unused(options, "without --paper-table or --protocol completion", _OF_SYSTEMS)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings
 
 if TYPE_CHECKING:
-    from lidargrit.evaluation.comparison import EvalConfig
+    from lidargrit.evaluation.evaluate import EvalConfig
 
 _OF_BOTH = ("samples", "reference", "protocol", "count", "device", "report", *SCANS)
 _OF_REFERENCE = ("samples", "protocol", "count", "device", *SCANS)
@@ -19,8 +19,8 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     """Score by the options; simulated streets have a picture in place of a page."""
     from lidargrit.core.errors import ConfigError
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.evaluation.comparison import compare_sources, read_config
     from lidargrit.evaluation.drives import DRIVE, MEASURED
+    from lidargrit.evaluation.evaluate import evaluate_sources, read_config
     from lidargrit.evaluation.protocols import public_name
     from lidargrit.evaluation.raydrop import evaluate_streets, streets_of
     from lidargrit.evaluation.reference_file import ENDING
@@ -43,7 +43,7 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     if streets is None:
         refuse_unused(options, "without --protocol streets", ("ray", *_OF_BOTH, *_OF_CARDS))
         refuse_to_overwrite(options.report, options.overwrite, ".html")
-        card, pair = compare_sources(*sets, config, options.ray)
+        card, pair = evaluate_sources(*sets, config, options.ray)
         report = partial(write_report, card, pair, options.report) if options.report else None
         return card.as_table(), card.to_json(), report
     refuse_unused(options, "with --protocol streets", (*_OF_BOTH, "model", "beside"))
@@ -56,8 +56,8 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
 def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Score forecasts of drives, or how well the scans of one or two sets of drives fit together."""
     from lidargrit.core.errors import UsageError
-    from lidargrit.evaluation.comparison import read_config
     from lidargrit.evaluation.drives import MEASURED, evaluate_drives, evaluate_forecast
+    from lidargrit.evaluation.evaluate import read_config
     from lidargrit.evaluation.protocols import public_name
 
     config = read_config(
@@ -78,7 +78,7 @@ def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
 def _saved(options: argparse.Namespace, config: "EvalConfig") -> tuple[str, dict[str, Any]]:
     """Save what metrics keep of the scans that stand where samples do, and return what the file holds."""
     from lidargrit.core.files import refuse_to_overwrite
-    from lidargrit.evaluation.comparison import save_reference
+    from lidargrit.evaluation.evaluate import save_reference
     from lidargrit.evaluation.reference_file import ENDING
 
     refuse_to_overwrite(options.save_reference, options.overwrite, ENDING)

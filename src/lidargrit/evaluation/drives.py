@@ -18,7 +18,6 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.pasts import Pasts
 from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import open_source
-from lidargrit.evaluation.comparison import EvalConfig
 from lidargrit.evaluation.drive_errors import (
     ErrorsOfForecast,
     consistency_chamfer_m2,
@@ -26,6 +25,7 @@ from lidargrit.evaluation.drive_errors import (
     forecast_errors,
     gem_errors,
 )
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.odometry import INSTALL, SETTLING_SCANS, kiss_icp_is_there, path_by_kiss_icp, path_errors
 from lidargrit.evaluation.protocols import load_protocol, public_name

@@ -10,7 +10,7 @@ from lidargrit.core.table import render
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION, Streets
 from lidargrit.data.images import RangeImages
 from lidargrit.data.sources import open_source
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.realism import CurveScore, SimulatedScans, StreetScans, compare, score_curves, tables
 from lidargrit.evaluation.street_figures import figures_table

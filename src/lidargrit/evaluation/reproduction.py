@@ -9,8 +9,8 @@ from typing import Any
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
-from lidargrit.evaluation.benchmark import Benchmark
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.compare import Benchmark
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.training import computing_time, plan_training

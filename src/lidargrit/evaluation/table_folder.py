@@ -7,8 +7,8 @@ from typing import Any
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.evaluation.benchmark import Benchmark, as_json
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation.compare import Benchmark, as_json
+from lidargrit.evaluation.evaluate import EvalConfig
 
 TABLE = "table.json"
 _CURE = "name the systems and settings once more: lidargrit compare OUT SYSTEM ..."

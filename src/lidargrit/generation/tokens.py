@@ -21,8 +21,8 @@ from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, Pixel
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig, make_tokenizer
 from lidargrit.generation.tokenizers.vqvae import VqvaeConfig
+from lidargrit.nn.collectives import sum_over_processes
 from lidargrit.nn.precision import Precision, in_full, products_in
-from lidargrit.nn.processes import sum_over_processes
 from lidargrit.nn.transformer import Transformer, TransformerConfig, resample_positions
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import Observed

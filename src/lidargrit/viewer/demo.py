@@ -15,7 +15,7 @@ from lidargrit.data.images import RangeImages
 from lidargrit.data.run_folder import PRETRAINED, RUN_FILE, locate, read_config
 from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.data.sources.samples import read_samples
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.evaluation.scorecard import Scorecard
@@ -182,7 +182,7 @@ def _score(samples: RangeImages, val: RangeImages) -> Scorecard:
         return EvalSet(name, images, evenly_spaced(count, len(images)))
 
     pair = EvalPair(some("samples", samples), some("held-out scans", val))
-    return compare_pair(pair, EvalConfig(pixel_statistics=True))
+    return evaluate_pair(pair, EvalConfig(pixel_statistics=True))
 
 
 _INTERRUPTED = " (interrupted)"  # end of the name of a stage that is not done yet, with the time that it took so far

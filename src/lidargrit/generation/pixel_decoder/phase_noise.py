@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor, nn
 
 from lidargrit.generation.pixel_decoder.pixel_phases import Phase
-from lidargrit.nn.processes import sum_over_processes
+from lidargrit.nn.collectives import sum_over_processes
 
 _REACH = 0.6  # correlation of a shared part between a pixel and the next of its phase
 _TERMS = 4  # of the series, whose error is below 2 % up to a correlation of 0.5

@@ -25,8 +25,8 @@ from lidargrit.generation.pixel_decoder.pixel_phases import (
 )
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
 from lidargrit.generation.range_steps import RangeSteps
+from lidargrit.nn.collectives import mean_over_processes
 from lidargrit.nn.precision import Precision, autocast_to
-from lidargrit.nn.processes import mean_over_processes
 from lidargrit.nn.random import of_host
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.planes import planes_of

@@ -12,9 +12,9 @@ from torch import Tensor
 from lidargrit.core import discovery
 from lidargrit.core.configuration import NamedConfig
 from lidargrit.generation.objective import Objective
+from lidargrit.nn.codebook import VectorQuantiser
 from lidargrit.nn.codes import CodeFeatures
 from lidargrit.nn.precision import Precision
-from lidargrit.nn.quantiser import VectorQuantiser
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, MaskDecoding, RangeImage, TokenGrid
 

@@ -12,8 +12,8 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds
 from lidargrit.generation.tokenizers import CodebookTokenizer, Config
 from lidargrit.nn.blocks import Network
+from lidargrit.nn.codebook import CodebookLoss, VectorQuantiser
 from lidargrit.nn.convolution import Convolution
-from lidargrit.nn.quantiser import CodebookLoss, VectorQuantiser
 from lidargrit.scans.types import RangeImage
 
 ResidualBlocks = Annotated[int, Bounds(1, 100)]

@@ -23,9 +23,9 @@ from lidargrit.generation.tokenizers._convolutional import (
     ResidualBlocks,
 )
 from lidargrit.nn.blocks import Block
+from lidargrit.nn.codebook import CodebookLoss
 from lidargrit.nn.convolution import Convolution, Downsample, ResidualBlock, group_norm
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.quantiser import CodebookLoss
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage, TokenGrid
@@ -54,7 +54,7 @@ class CurveVqvaeConfig(TokenizerConfig):
             drops what is decoded to 56 m and more; here that is a return.
         mask_head: whether a second channel of the decoder learns which beams return. Without it, a range of a few
             millimetres stands for no return.
-        codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser. LiDM's program has
+        codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.codebook. LiDM's program has
             the same bug as ``reference``.
         restart_dead_codes: whether codes that are hardly ever used restart from latents; LiDM's program does not do
             this.

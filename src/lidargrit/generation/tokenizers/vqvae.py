@@ -25,6 +25,7 @@ from lidargrit.generation.tokenizers._convolutional import (
     NumCodes,
     ResidualBlocks,
 )
+from lidargrit.nn.codebook import CodebookLoss
 from lidargrit.nn.convolution import (
     Convolution,
     Downsample,
@@ -36,7 +37,6 @@ from lidargrit.nn.convolution import (
 )
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import Precision, at_least_32_bits, dtype_of
-from lidargrit.nn.quantiser import CodebookLoss
 from lidargrit.scans.example import Example
 from lidargrit.scans.projection import EncodingName, RangeEncoding
 from lidargrit.scans.sensors import SensorModel
@@ -77,7 +77,7 @@ class VqvaeConfig(TokenizerConfig):
             weighs near surfaces more, the second far ones.
         reflectance: whether reflectance is encoded and decoded beside the range; not so in the paper. Both are mapped
             to [-1, 1], and their errors weigh alike, as in R2DM and LiDARGen.
-        codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.quantiser.
+        codebook_loss: ``paper``, ``reference``, ``vqvae`` or ``ema``; see lidargrit.nn.codebook.
         restart_dead_codes: whether codes that are hardly ever used restart from latents, so that the codebook does not
             collapse; the reference has no such remedy.
     """

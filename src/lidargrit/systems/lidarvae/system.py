@@ -14,8 +14,8 @@ from lidargrit.data.images import RangeImages
 from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
+from lidargrit.nn.collectives import num_processes
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.processes import num_processes
 from lidargrit.nn.random import normal_latents
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example

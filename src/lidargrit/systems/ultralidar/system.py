@@ -16,9 +16,9 @@ from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
+from lidargrit.nn.collectives import of_first_process, sample_from_all, sum_over_processes
 from lidargrit.nn.flops import flops_of
 from lidargrit.nn.precision import in_full, inference
-from lidargrit.nn.processes import of_first_process, sample_from_all, sum_over_processes
 from lidargrit.nn.random import gumbel_of, sample_index
 from lidargrit.scans.condition import Condition
 from lidargrit.scans.example import Example

@@ -18,8 +18,8 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.nn.blocks import Network
+from lidargrit.nn.codebook import Quantised, VectorQuantiser
 from lidargrit.nn.flops import flops_of
-from lidargrit.nn.quantiser import Quantised, VectorQuantiser
 from lidargrit.systems.ultralidar.swin import SwinConfig, initialise_linear, sine_cosine_positions, swin_blocks
 from lidargrit.systems.ultralidar.voxels import VoxelGrid
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from lidargrit.nn.quantiser import VectorQuantiser
+from lidargrit.nn.codebook import VectorQuantiser
 
 
 @pytest.mark.shared

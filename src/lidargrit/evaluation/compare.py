@@ -24,8 +24,8 @@ from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
 from lidargrit.data.sources import Source, data_set_of, open_source
 from lidargrit.data.sources.samples import read_samples
-from lidargrit.evaluation.comparison import EvalConfig, compare_pair, metric_factory, open_pair
 from lidargrit.evaluation.costs import COSTS, Costs, costs_table, read_costs
+from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair, metric_factory, open_pair
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.pairs import EvalPair, require_same_rays
 from lidargrit.evaluation.protocols import MetricChoice, load_protocol, public_name
@@ -363,7 +363,7 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path) -> None:
         if known == wanted and not _has_other_weights(there, pair, settings):
             reporting.message(f"scores are there already; remove {path} to score again")
             return
-    write_json(path, compare_pair(pair, settings).to_json())
+    write_json(path, evaluate_pair(pair, settings).to_json())
 
 
 def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig) -> bool:

@@ -166,7 +166,7 @@ def _weights(words: Sequence[str]) -> dict[str, Path]:
     return files
 
 
-def compare_sources(
+def evaluate_sources(
     samples: str, reference: str, settings: EvalConfig | None = None, ray: str = ""
 ) -> tuple[Scorecard, EvalPair]:
     """Score a folder of samples, or any source of scans, against another.
@@ -199,7 +199,7 @@ def compare_sources(
     pair = open_pair(first, second, settings)
     with connected(ray):
         there = Cluster(ray, partial(_pair_of, samples, reference, settings), settings.device != "cpu")
-        card = compare_pair(pair, settings, there if ray else None)
+        card = evaluate_pair(pair, settings, there if ray else None)
     for warning in card.warnings[len(pair.warnings) :]:
         reporting.message(f"WARNING: {warning}")
     return card, pair
@@ -263,7 +263,7 @@ def save_reference(scans: str, path: Path, settings: EvalConfig) -> ReferenceFil
     return write_reference(path, by, opened, real, both, settings.resampling, keep_all=bool(settings.metrics))
 
 
-def compare_pair(pair: EvalPair, settings: EvalConfig, cluster: Cluster | None = None) -> Scorecard:
+def evaluate_pair(pair: EvalPair, settings: EvalConfig, cluster: Cluster | None = None) -> Scorecard:
     """Score two opened sets, by a cluster if one is given.
 
     Raises:

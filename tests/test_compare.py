@@ -15,10 +15,10 @@ from lidargrit.core.files import claim_folder
 from lidargrit.data.datasets import load
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
-from lidargrit.evaluation import benchmark
-from lidargrit.evaluation.benchmark import Benchmark, as_json, as_table
-from lidargrit.evaluation.benchmark import run as run_benchmark
-from lidargrit.evaluation.comparison import EvalConfig
+from lidargrit.evaluation import compare
+from lidargrit.evaluation.compare import Benchmark, as_json, as_table
+from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.generation.generator import load_class
 from lidargrit.generation.presets import load_preset
@@ -365,12 +365,12 @@ def test_a_page_of_foreign_names_holds_no_code_of_theirs():
 
 
 def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "train", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr(compare, "train", lambda *_: pytest.fail("trained"))
 
     def no_weights(*_args, **_options):
         raise LidarGritError("no weights", "weights", "get them")
 
-    monkeypatch.setattr(benchmark, "metric_factory", lambda *_args, **_options: no_weights)
+    monkeypatch.setattr(compare, "metric_factory", lambda *_args, **_options: no_weights)
     with pytest.raises(LidarGritError, match="no weights"):
         run_benchmark(["marginal"], tmp_path / "table", BENCHMARK)
 
@@ -386,7 +386,7 @@ def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
 
 
 def test_a_folder_that_cannot_be_is_refused_before_the_reference_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "_check_reference", lambda *_: pytest.fail("it read the reference first"))
+    monkeypatch.setattr(compare, "_check_reference", lambda *_: pytest.fail("it read the reference first"))
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="File exists"):
         run_benchmark(["marginal"], tmp_path / "file", BENCHMARK)

@@ -7,8 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lidargrit.nn.collectives import sample_from_all, sum_over_processes
 from lidargrit.nn.precision import in_full
-from lidargrit.nn.processes import sample_from_all, sum_over_processes
 
 CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
 
