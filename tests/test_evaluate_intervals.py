@@ -9,10 +9,10 @@ import torch
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError
 from lidargrit.evaluation.intervals import Part, Resampling, around, blocks, interval_of, merged, real_against_real
-from lidargrit.evaluation.metrics import ImageMetric, load_metric
+from lidargrit.evaluation.metrics import ImageMetric, MetricResult, load_metric
 from lidargrit.evaluation.metrics.shared.accumulators import RowAccumulator
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.scans.types import MetricResult, RangeImage
+from lidargrit.scans.types import RangeImage
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
 PLAIN = [name for name in discovery.names("metrics") if not load_metric(name).needs_weights]

@@ -12,13 +12,13 @@ import torch
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, UnknownNameError
-from lidargrit.evaluation.metrics import Metric, lidm_bev_matching, load_metric
+from lidargrit.evaluation.metrics import Metric, MetricResult, lidm_bev_matching, load_metric
 from lidargrit.evaluation.metrics.shared import clouds
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
 from lidargrit.evaluation.metrics.shared.labelled import LabelMetric
 from lidargrit.evaluation.metrics.shared.networks.network import PretrainedNetwork
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.scans.types import MetricResult, RangeImage
+from lidargrit.scans.types import RangeImage
 from seeded_networks import weights_folder
 
 CASES = [(name, variant) for name in discovery.names("metrics") for variant in load_metric(name).variants]

@@ -11,10 +11,10 @@ import torch
 from lidargrit.evaluation import profiles
 from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score
+from lidargrit.evaluation.metrics import MetricResult
 from lidargrit.evaluation.profiles import matches, profile, searched_scans
 from lidargrit.evaluation.scorecard import LeftOut
 from lidargrit.scans.projection import points_of_pixels
-from lidargrit.scans.types import MetricResult
 from lidargrit.viewer._page import document
 from lidargrit.viewer.report import page, write_report
 from lidargrit.viewer.report_charts import line_chart, score_chart

@@ -11,8 +11,8 @@ from lidargrit.core.errors import OutputError
 from lidargrit.core.files import write_json
 from lidargrit.core.table import render
 from lidargrit.evaluation.intervals import Score, around
+from lidargrit.evaluation.metrics import MetricResult
 from lidargrit.evaluation.tables import side_by_side
-from lidargrit.scans.types import MetricResult
 from test_verdict import card, score
 from tiny_runs import the_one_line
 

@@ -15,12 +15,11 @@ from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.core.table import render
 from lidargrit.evaluation.intervals import Interval, RealAgainstReal, Score, around
-from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics import MetricResult, load_metric
 from lidargrit.evaluation.scorecard import EvalSetRecord, LeftOut, Scorecard
 from lidargrit.evaluation.tables import compare_systems, judge, share_pixel_statistics, side_by_side
 from lidargrit.evaluation.verdict import ENOUGH, _measured, blind_to, notes_on_floors, tells_apart, verdict
 from lidargrit.publishing.card import _scores
-from lidargrit.scans.types import MetricResult
 from lidargrit.viewer.report_charts import score_table
 from lidargrit.viewer.table_page import table_page
 

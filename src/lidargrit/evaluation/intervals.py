@@ -24,8 +24,7 @@ from jaxtyping import Float64
 from scipy.special import stdtrit
 
 from lidargrit.core.errors import ConfigError, DataError
-from lidargrit.evaluation.metrics import Metric
-from lidargrit.scans.types import MetricResult
+from lidargrit.evaluation.metrics import Metric, MetricResult
 
 _HALVINGS = 5  # of the reference against itself: their mean is reported, not their spread
 _AT_LEAST = 4  # groups: fewer have too few halves

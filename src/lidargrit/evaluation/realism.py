@@ -15,11 +15,11 @@ from lidargrit.data.datasets.shared.streets import Streets
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.source import Source
-from lidargrit.evaluation.metrics import load_metric
+from lidargrit.evaluation.metrics import MetricResult, load_metric
 from lidargrit.evaluation.street_figures import StreetFigures
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.sensors import SensorModel, load_sensor
-from lidargrit.scans.types import MetricResult, RangeImage
+from lidargrit.scans.types import RangeImage
 from lidargrit.simulator import Observation, observe
 
 CURVES = (

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -376,25 +376,3 @@ class Decoded:
 
     def _masked(self, return_mask: Bool[Tensor, "B H W"]) -> RangeImage:
         return RangeImage.masked(self.range_m, return_mask, self.sensor, planes_of(reflectance=self.reflectance))
-
-
-@dataclass(frozen=True)
-class MetricResult:
-    """The value of a metric, with what is needed to read it.
-
-    Args:
-        value: value of the metric, in its unit.
-        higher_is_better: whether a larger value is better.
-        num_generated: number of generated scans.
-        num_reference: number of real scans.
-        variant: name of the definition, such as ``exact`` or ``reference``.
-        details: further numbers by name, such as the value at every level.
-    """
-
-    metric: str
-    value: float
-    higher_is_better: bool
-    num_generated: int
-    num_reference: int
-    variant: str
-    details: dict[str, Any] = field(default_factory=dict)

@@ -4,7 +4,7 @@ import math
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar, final
 
 import numpy as np
@@ -14,12 +14,34 @@ from lidargrit.core import discovery
 from lidargrit.core.errors import ConfigError, DataError, nearest_names
 from lidargrit.evaluation.metrics.shared.accumulators import Accumulator, Kept
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.scans.types import MetricResult, RangeImage
+from lidargrit.scans.types import RangeImage
 
 _CHUNK = 16  # images at a time: the points of 64x1024 pixels take 13 MB
 
 
 Features = TypeVar("Features")
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """The value of a metric, with what is needed to read it.
+
+    Args:
+        value: value of the metric, in its unit.
+        higher_is_better: whether a larger value is better.
+        num_generated: number of generated scans.
+        num_reference: number of real scans.
+        variant: name of the definition, such as ``exact`` or ``reference``.
+        details: further numbers by name, such as the value at every level.
+    """
+
+    metric: str
+    value: float
+    higher_is_better: bool
+    num_generated: int
+    num_reference: int
+    variant: str
+    details: dict[str, Any] = field(default_factory=dict)
 
 
 class FeatureExtractor(ABC, Generic[Features]):

@@ -25,7 +25,7 @@ _BYTES_AT_MOST = 1 << 30  # of one file, unpacked: a batch of 500 scans of 5 cha
 _SCANS_AT_MOST = 1 << 20
 _POINT_WITHOUT_COLOUR = re.compile(rb"(-?\d+\.\d{3} ){3}0\.000 0\.000 0\.000\r?\n")
 
-Decoded = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
+RangeAndReflectance = tuple[Float[Tensor, "H W"], Float[Tensor, "H W"] | None]
 """Metres, 0 where nothing returned; reflectance in [0, 1] if there is one."""
 
 
@@ -73,7 +73,7 @@ class SampleFormat:
     channels: int
     sensors: tuple[tuple[str, int, int], ...]
     variant: str
-    decode: Callable[[Tensor], Decoded]
+    decode: Callable[[Tensor], RangeAndReflectance]
     suffix: str = ".pth"
     read: Callable[[Path], Tensor] = read_tensor
 

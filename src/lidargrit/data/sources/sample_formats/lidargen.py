@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from lidargrit.data.sources.sample_formats import Decoded, SampleFormat
+from lidargrit.data.sources.sample_formats import RangeAndReflectance, SampleFormat
 
 _NEAR_M, _FAR_M = 0.5, 63.0  # the widest window of its scores; there is no other sign of a missing return
 
 
-def decode(scan: Tensor) -> Decoded:
+def decode(scan: Tensor) -> RangeAndReflectance:
     """Undo the logarithm; what lies outside of 0.5 to 63 m is no return."""
     range_m = torch.exp2(6 * scan[0]) - 1
     returned = (range_m > _NEAR_M) & (range_m < _FAR_M)

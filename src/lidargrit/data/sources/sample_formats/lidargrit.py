@@ -2,10 +2,10 @@
 
 from torch import Tensor
 
-from lidargrit.data.sources.sample_formats import Decoded, SampleFormat
+from lidargrit.data.sources.sample_formats import RangeAndReflectance, SampleFormat
 
 
-def decode(scan: Tensor) -> Decoded:
+def decode(scan: Tensor) -> RangeAndReflectance:
     """Take the range as it is."""
     return scan[0], None
 

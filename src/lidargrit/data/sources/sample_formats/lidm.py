@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import read_bytes
-from lidargrit.data.sources.sample_formats import Decoded, SampleFormat
+from lidargrit.data.sources.sample_formats import RangeAndReflectance, SampleFormat
 from lidargrit.scans.sensors import load_sensor
 
 _BYTES_AT_MOST = 1 << 26  # of one file: 65,536 points take 3 MB
@@ -50,7 +50,7 @@ def read(path: Path) -> Tensor:
     return torch.from_numpy(np.where(np.isfinite(image_m), image_m, 0))[None].float()
 
 
-def decode(scan: Tensor) -> Decoded:
+def decode(scan: Tensor) -> RangeAndReflectance:
     """Take the range as it is; there is no reflectance."""
     return scan[0], None
 

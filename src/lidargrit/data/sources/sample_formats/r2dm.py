@@ -2,10 +2,10 @@
 
 from torch import Tensor
 
-from lidargrit.data.sources.sample_formats import Decoded, SampleFormat
+from lidargrit.data.sources.sample_formats import RangeAndReflectance, SampleFormat
 
 
-def decode(scan: Tensor) -> Decoded:
+def decode(scan: Tensor) -> RangeAndReflectance:
     """Take the range as it is, 0 where it lay outside of 1.45 to 80 m, and the last channel."""
     range_m = scan[0]
     return range_m, scan[4] * (range_m > 0)

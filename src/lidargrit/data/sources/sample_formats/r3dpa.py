@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lidargrit.core.arrays import mapped_member
 from lidargrit.core.errors import ScanError
-from lidargrit.data.sources.sample_formats import Decoded, SampleFormat
+from lidargrit.data.sources.sample_formats import RangeAndReflectance, SampleFormat
 
 _NEAR_M, _FAR_M = 1.0, 56.0  # between which evaluate.py takes a depth for a return
 
@@ -26,7 +26,7 @@ def read(path: Path) -> Tensor:
         raise ScanError(got, wanted, "sample anew, or score the folder pcd beside it") from None
 
 
-def decode(scan: Tensor) -> Decoded:
+def decode(scan: Tensor) -> RangeAndReflectance:
     """Take the depth where it is a return; there is no reflectance."""
     depth_m = scan[0].float()
     return torch.where((depth_m > _NEAR_M) & (depth_m < _FAR_M), depth_m, 0), None
