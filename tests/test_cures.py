@@ -123,7 +123,7 @@ def test_every_option_that_a_message_names_is_taken(verb, scans, tmp_path, capsy
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
     cut_short = lambda *_args, **_options: pytest.skip("begun to train")  # noqa: E731
-    for place in ("training.run.train", "training.train", "viewer.demo.train", "evaluation.benchmark.train"):
+    for place in ("training.run.train", "training.train", "viewer.demo.train", "evaluation.compare.train"):
         monkeypatch.setattr(f"lidargrit.{place}", cut_short)
     refused = 0
     for fault in FAULTS:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.core.errors import DataError
+from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.data.batches import Batches
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.pasts import Pasts
@@ -13,7 +13,9 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.sources import load_range_images
 from lidargrit.data.windows import TimedScan, drives_in
+from lidargrit.generation import conditions
 from lidargrit.generation.generator import load
+from lidargrit.generation.presets import load_preset
 from lidargrit.generation.settings import Preset, TrainingConfig
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.motion import Motion
@@ -22,6 +24,8 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.warp import warp
 from lidargrit.systems.forecaster.system import Forecaster, ForecasterObjective
 from lidargrit.training import train
+from lidargrit.training.compute import uniform_images
+from lidargrit.training.plan import check_stages
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128, 4)
 CONFIG = DataConfig(columns=128, column_stride=4, workers=1)
@@ -101,6 +105,19 @@ def test_a_forecaster_is_told_as_many_past_scans_as_its_configuration_says(drive
     words = ["--protocol", "forecast", "--model", str(run), "--set", "data.columns=128", "data.column_stride=4"]
     assert main(["evaluate", tree, *words]) == 0  # three scans are enough
     assert {*forecast_from} == {2}
+
+
+def test_images_without_a_drive_tell_as_many_empty_scans_as_the_generator_takes():
+    preset = load_preset("forecaster_compact", ["model.past_scans=3"])
+    generator = preset.build_generator()
+    told = conditions.load("past", generator.past_scans).of(uniform_images(generator.sensor, 2))
+    assert told.range_m.shape[:2] == (2, 3)
+
+
+def test_a_generator_that_takes_a_past_says_of_how_many_scans(monkeypatch):
+    monkeypatch.setattr(Forecaster, "past_scans", 0)
+    with pytest.raises(ConfigError, match="condition=past for 'forecaster', whose past_scans is 0"):
+        check_stages(load_preset("forecaster_compact"))
 
 
 def moving(times_s: list[float | None], places_m: list[float | None]) -> list[TimedScan]:

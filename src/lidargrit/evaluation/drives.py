@@ -153,7 +153,7 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
 
 def _forecaster(model: str, device: str) -> Generator:
     generator = load(locate(model, "drive"))
-    if Past not in generator.takes:
+    if not generator.past_scans:
         got = f"the model {model}, which takes no past"
         raise ConfigError(got, "one that forecasts", "leave --model out, or train one with data.condition=past")
     return generator.to(usable_device(device))

@@ -54,7 +54,7 @@ class SmallUnetConfig(Settings):
             raise ConfigError(
                 f"{self.attention_layers} layers of attention of {self.heads} heads, {self.widths[-1]} channels",
                 f"at most {self.blocks} layers, one after each residual block, and heads that divide the channels",
-                "change attention_layers, blocks, heads or the last of widths",
+                "change them, as in model.completion.heads=2 or model.segmenter.heads=2",
             )
 
 

@@ -189,9 +189,9 @@ def uniform_images(sensor: SensorModel, count: int) -> RangeImage:
     return RangeImage(range_m, mask, sensor, {"reflectance": torch.full_like(range_m, 0.65), "label": label})
 
 
-def _uniform_examples(preset: Preset, sensor: SensorModel) -> Example:
+def _uniform_examples(preset: Preset, generator: Generator, sensor: SensorModel) -> Example:
     images = uniform_images(sensor, _SCANS)
-    return Example(images, conditions.load(preset.data.condition).of(images))
+    return Example(images, conditions.load(preset.data.condition, generator.past_scans).of(images))
 
 
 class _SeedOfNoValues(torch.Generator):
@@ -209,11 +209,11 @@ def _cost_without_values(preset: Preset, generator: Generator, stage: str, senso
         for name, buffer in module.named_buffers(recurse=False):
             if buffer.ndim == 0 and not buffer.is_floating_point():  # a counter, by which steps differ
                 module.register_buffer(name, torch.zeros_like(buffer, device="cpu"))
-    return _cost(objective, _uniform_examples(preset, sensor).to("meta"), _SeedOfNoValues)
+    return _cost(objective, _uniform_examples(preset, generator, sensor).to("meta"), _SeedOfNoValues)
 
 
 def _cost_with_values(preset: Preset, generator: Generator, stage: str, sensor: SensorModel) -> StageCost:
-    return _cost(generator.objective(stage), _uniform_examples(preset, sensor), torch.Generator)
+    return _cost(generator.objective(stage), _uniform_examples(preset, generator, sensor), torch.Generator)
 
 
 def _cost(objective: Objective, example: Example, make_rng: Callable[[], torch.Generator]) -> StageCost:

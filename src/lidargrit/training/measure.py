@@ -72,7 +72,8 @@ class _Timed(NamedTuple):
 def _timed(preset: Preset, stage: str) -> _Timed:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
-        generator, condition = preset.build_generator(), conditions.load(preset.data.condition)
+        generator = preset.build_generator()
+        condition = conditions.load(preset.data.condition, generator.past_scans)
         config, objective = preset.settings_of(stage), generator.objective(stage)
         engine, _ = begin_training(objective, config)
         images = uniform_images(preset.data.load_sensor(), config.batch_size // engine.world_size).to(engine.device)

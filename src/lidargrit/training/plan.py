@@ -119,14 +119,12 @@ class CheckedStages:
         taken: trained stages of another run, which are taken as they are or trained further.
         frozen: run from which a stage is taken as it is, by the name of the stage; the others are trained.
         told: source of the condition that the generator is told of each scan.
-        past_scans: number of scans before each in its drive that the generator is told instead; 0 for none.
     """
 
     objectives: Mapping[str, Objective]
     taken: Mapping[str, Objective]
     frozen: Mapping[str, str]
     told: ToldOfScans
-    past_scans: int
 
     @property
     def trained(self) -> dict[str, Objective]:
@@ -155,12 +153,14 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
         generator = preset.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
     taken = taken_stages(preset, generator)
-    told = conditions.load(preset.data.condition)
+    told = conditions.load(preset.data.condition, generator.past_scans)
     if told.kind is not Nothing and told.kind not in generator.takes:
         got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, which cannot be told it"
         raise ConfigError(got, "a generator that takes it", "leave it out")
-    past_scans = generator.past_scans if told.kind is Past else 0
-    checked = CheckedStages(objectives, taken, preset.frozen, told, past_scans)
+    if told.kind is Past and not told.past_scans:
+        got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, whose past_scans is 0"
+        raise ConfigError(got, "a generator that says how many scans it is told", "write its property past_scans")
+    checked = CheckedStages(objectives, taken, preset.frozen, told)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)
     return checked

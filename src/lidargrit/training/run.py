@@ -106,8 +106,8 @@ def _train(
                 objective.load_state_dict({**objective.state_dict(), **taken})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = preset.data.workers, preset.settings_of(stage)
-            told = (checked.told, checked.past_scans)
-            return StageTraining(objective, config, folder / stage, seed, built_on, workers, *told, picture).begun()
+            how = (config, folder / stage, seed, built_on, workers, checked.told)
+            return StageTraining(objective, *how, picture).begun()
 
         built_on = ""
         for number, stage in enumerate(generator.stages):

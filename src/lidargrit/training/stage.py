@@ -80,7 +80,6 @@ class StageTraining:
         seed: seed of order, augmentation, dropout and the objective's random numbers.
         built_on: fingerprint of the earlier stage's weights; a checkpoint with another one is refused.
         condition: source of what the generator is told of each scan.
-        past_scans: number of scans before each in its drive that it is told instead; 0 for none.
         plot: function that plots the averaged objective into a file; None for no pictures.
         deadline_s: value of ``time.monotonic()`` at which training stops as it does by SIGTERM.
     """
@@ -92,7 +91,6 @@ class StageTraining:
     built_on: str = ""
     workers: int = 1
     condition: ToldOfScans = field(default_factory=NothingTold)
-    past_scans: int = 0
     plot: Callable[[Objective, Path], None] | None = None
     deadline_s: float = math.inf
 
@@ -146,7 +144,7 @@ class StageTraining:
             self.workers,
             self.condition.of,
             self.objective.keeps_encodings,
-            self.past_scans,
+            self.condition.past_scans,
         )
         begun = time.monotonic()
         progress_bar = reporting.progress(what, config.scans, self.scans_seen)
@@ -187,7 +185,8 @@ class StageTraining:
             Terminated: SIGTERM was received meanwhile; the resumed training validates again.
         """
         chosen = evenly_spaced(self.config.validation_scans, len(images))
-        pasts = Pasts(images, self.past_scans) if self.past_scans else None
+        past_scans = self.condition.past_scans
+        pasts = Pasts(images, past_scans) if past_scans else None
         totals: dict[str, float] = {}
         # As many at once as a process has in a step, since more may not fit in memory.
         at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))

@@ -17,7 +17,7 @@ gem = Protocol(
         "a fault of the program, kept: it moves points above +3 and below -25 degrees into its outer rows, and "
         "compares with images, not with the scans",
         "the program scores the first 500 scans of each drive, each as often as one of its windows forecasts it; here "
-        "every scan with five before it, once at each horizon",
+        "every scan with a whole past before it, once at each horizon",
         "the program's past are five scans as far apart as the forecasts are; here they follow one another",
         "its L1 and AbsRel are not built: those of the protocol forecast are of the same rays, without the clamping",
     ),

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from lidargrit.core import discovery
 from lidargrit.scans.condition import Condition
+from lidargrit.scans.past import Past
 from lidargrit.scans.types import RangeImage
 
 
@@ -14,12 +15,20 @@ class ToldOfScans(ABC):
     kind: ClassVar[type[Condition]]
     """Conditions that it returns; a generator that learns by them has them in ``takes``."""
 
+    def __init__(self, past_scans: int = 0) -> None:
+        self.past_scans = past_scans if self.kind is Past else 0
+        """Number of scans before each in its drive that the generator is told, where a drive has them; 0 for none."""
+
     @abstractmethod
     def of(self, images: RangeImage) -> Condition:
         """Return what a generator is told of each image."""
 
 
-def load(name: str) -> ToldOfScans:
-    """Return the kind of condition of a name, or raise UnknownNameError."""
+def load(name: str, past_scans: int = 0) -> ToldOfScans:
+    """Return the kind of condition of a name, or raise UnknownNameError.
+
+    Args:
+        past_scans: number of past scans that the generator takes.
+    """
     kind: type[ToldOfScans] = discovery.load_class("conditions", name, ToldOfScans)
-    return kind()
+    return kind(past_scans)

@@ -12,4 +12,4 @@ class PastTold(ToldOfScans):
 
     def of(self, images: RangeImage) -> Past:
         """Return that there was nothing before."""
-        return Past.nothing(images.sensor, len(images), 1).to(images.range_m.device)
+        return Past.nothing(images.sensor, len(images), self.past_scans).to(images.range_m.device)

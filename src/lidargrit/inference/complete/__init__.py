@@ -57,7 +57,11 @@ class Model:
 
     def complete(self, condition: Observed, seeds: Sequence[int]) -> RangeImage:
         """Return scans that keep what was observed, one for each seed, in the computer's memory."""
-        return self.generator.complete(condition, seeds, self.sampling).to("cpu")
+        size, parts = self.batch_size, []
+        for first in range(0, len(condition), size):  # a GPU holds one batch at a time
+            some = slice(first, first + size)
+            parts.append(self.generator.complete(condition[some], seeds[some], self.sampling).to("cpu"))
+        return RangeImage.cat(parts)
 
     def learned_from(self) -> Provenance:
         """Return the training scans; none of a classical method."""
