@@ -366,7 +366,7 @@ def test_the_command_line_writes_scores_page_and_table(tmp_path, capsys, sets):
         ([*words, *files], "there already"),
         (["evaluate", sets[0]], "alone; wanted samples and what they are compared with"),
         ([*words, "--weights", "pointnet"], "NAME=FILE"),
-        ([*words, "--protocol", "r3dm"], "wanted one of"),
+        ([*words, "--protocol", "r3dm"], "wanted one such as"),
         ([*words, "--groups", "2"], "--groups 2"),
     ):
         assert main(wrong) != 0
