@@ -25,7 +25,6 @@ from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING
-from lidargrit.scans.past import Past
 from lidargrit.scans.projection.image import told_share
 from lidargrit.scans.sensors import SensorModel
 
@@ -143,7 +142,7 @@ def _bits(
 
 def _pasts(generator: Generator, scans: RangeImages | EvalSet) -> Pasts | None:
     """Return the pasts of scans of drives for a generator that takes them; None for other scans and generators."""
-    if Past in generator.takes and isinstance(scans, RangeImages):
+    if generator.past_scans and isinstance(scans, RangeImages):
         with suppress(DataError):  # of scans that are no drives
             return Pasts(scans, generator.past_scans)
     return None

@@ -76,11 +76,9 @@ def score_raydrop(generator: Generator, scans: str, clean: RangeImage, true: Ran
         true: measured range images of the same scans, with true drops.
     """
     _check(generator)
-    size, dropped = generator.batch_size(), []
-    for first in range(0, len(clean), size):  # a GPU holds one batch at a time
-        some = clean[first : first + size]
-        dropped.append(generator.complete(Observed.of_surfaces(some), range(first, first + len(some))).to("cpu"))
-    return score_curves(RangeImage.cat(dropped), clean, true, RAYDROP_CURVES, scans)
+    dropped = generator.stream(range(len(clean)), condition=Observed.of_surfaces(clean))
+    images = RangeImage.stack([image.to("cpu") for image in dropped])
+    return score_curves(images, clean, true, RAYDROP_CURVES, scans)
 
 
 def raydrop_model(word: str, device: str = "") -> Generator:

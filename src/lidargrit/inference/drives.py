@@ -153,7 +153,7 @@ def write_drives(
     Returns:
         Number of scans that are there now.
     """
-    if Past not in generator.takes:
+    if not generator.past_scans:
         got = f"a model of {generator.public_name()!r}, which takes no past"
         raise ConfigError(got, "a model of drives", "train one: lidargrit train forecaster_compact OUT")
     settings = generator.Sampling() if sampling is None else sampling

@@ -106,8 +106,8 @@ def _train(
                 objective.load_state_dict({**objective.state_dict(), **taken})
             picture = None if plot is None else partial(_plot, plot, generator, stage, val_images)
             workers, config = preset.data.workers, preset.settings_of(stage)
-            how = (config, folder / stage, seed, built_on, workers, checked.told)
-            return StageTraining(objective, *how, picture).begun()
+            of_stage = (objective, config, folder / stage, seed, built_on, workers, checked.told, picture)
+            return StageTraining(*of_stage).begun()
 
         built_on = ""
         for number, stage in enumerate(generator.stages):

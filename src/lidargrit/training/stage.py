@@ -185,8 +185,7 @@ class StageTraining:
             Terminated: SIGTERM was received meanwhile; the resumed training validates again.
         """
         chosen = evenly_spaced(self.config.validation_scans, len(images))
-        past_scans = self.condition.past_scans
-        pasts = Pasts(images, past_scans) if past_scans else None
+        pasts = Pasts(images, self.condition.past_scans) if self.condition.past_scans else None
         totals: dict[str, float] = {}
         # As many at once as a process has in a step, since more may not fit in memory.
         at_once = max(1, self.config.batch_size // (self.engine.world_size * self.config.accumulate))
