@@ -8,7 +8,7 @@ import torch
 from lidargrit.core.errors import ConfigError
 from lidargrit.generation.presets import load_preset
 from lidargrit.nn.decoding import CachedDecoder
-from lidargrit.nn.transformer import CausalTransformer, TransformerConfig
+from lidargrit.nn.transformer import CausalTransformer, TokensAround, TransformerConfig
 from lidargrit.nn.windows import Windows
 from lidargrit.scans.example import Example
 from lidargrit.scans.types import RangeImage
@@ -58,6 +58,8 @@ def test_a_window_takes_the_tokens_of_its_columns_and_a_drawn_one_learns_none_tw
     assert not counted[~first][:, :1].any()
     assert counted[~first][:, 1:].all()
     assert set(many[~first][:, 1].tolist()) == set(range(2, 6)), "every start comes up"
+    drawn, _ = Windows((2, 200), 8).draw(1000, torch.Generator().manual_seed(1))
+    assert 0.07 < float((drawn[:, -1] == 199).float().mean()) < 0.13, "the last window, of 193 starts"
 
 
 @pytest.mark.parametrize("static", [False, True])
@@ -118,6 +120,24 @@ def test_the_first_columns_reach_the_last(transformer):
     with torch.no_grad():
         moved = (nats_of_tokens(transformer, grid) - nats_of_tokens(transformer, changed)).abs()
     assert float(moved[..., -1].max()) > 1e-4
+
+
+@pytest.mark.parametrize("start", [2, 9, 14])
+def test_tokens_around_a_position_are_those_beside_it_in_the_turn_that_come_before_it(start):
+    columns, around, none = [0, *range(start, start + 7)], TokensAround((8, 4), 3, turn=21), 32
+    beside = [(0, -2), (0, -3), (-1, -2), (-1, -1), (-1, 0), (-1, 1), (-1, 2), (-2, -1), (-2, 0), (-2, 1), (-3, 0)]
+    beside += [(1, -1), (1, 0), (1, 1), (2, 0), (3, 0)]
+    wanted = []
+    for place, column in enumerate(columns):
+        for row in range(4):
+            for right, down in beside:
+                there = (column + right) % 21
+                before = there in columns and (right == 0 or columns.index(there) < place)
+                known = before and 0 <= row + down < 4
+                wanted.append(4 * columns.index(there) + row + down + 1 if known else none)
+    assert around.places(torch.tensor([columns] * 2)).flatten(1).tolist() == [wanted] * 2
+    ahead = around.places(torch.tensor(columns))[-4:, 11:] != none
+    assert bool(ahead.any()) == (start == 14), "only the last window ends where the scan begins"
 
 
 def small_system(columns=512):

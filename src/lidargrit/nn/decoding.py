@@ -89,6 +89,7 @@ class CachedDecoder:
         self._embedding = embedding.to(dtype)
         self._positions = transformer.positions().detach().to(dtype, copy=True)
         self._around = transformer.around
+        self._places = torch.empty(0) if self._around is None else self._around.places(None).clone()
         tables = None if self._around is None else self._around.tables(embedding).detach()
         self._tables = torch.empty(0) if tables is None else tables.to(dtype)
         self._blocks = [_Block(block, heads, precision) for block in transformer.blocks]
@@ -127,6 +128,8 @@ class CachedDecoder:
         chances, found = (each.unflatten(1, self._windows.grid_size) for each in (uniform, observed.clone()))
         for columns, known in self._windows.in_turn():
             self._positions.copy_(self._positions_of(columns))
+            if self._around is not None:
+                self._places.copy_(self._around.places(columns))
             inputs = (self._windows.take(each, columns) for each in (chances, found))
             tokens = self._sequence(*inputs, known=known * self._windows.grid_size[0])
             found[:, :, columns] = tokens.unflatten(1, (len(columns), -1)).transpose(1, 2)
@@ -164,7 +167,7 @@ class CachedDecoder:
         read = F.pad(known[:, :-1], (1, 0), value=self._start)
         x = F.embedding(read, self._embedding) + self._positions[:count]
         if self._around is not None:
-            x = x + self._around.added(self._around.around(read), self._tables)
+            x = x + self._around.added(self._around.around(read, self._places), self._tables)
 
         def attended(layer: int, block: _Block, x: Tensor) -> Tensor:
             parts = block.query_key_value(block.norm1(x), None).unflatten(0, (-1, count))
@@ -198,7 +201,7 @@ class CachedDecoder:
         x = F.embedding(tokens, self._embedding) + at(self._positions)
         if self._around is None:
             return x
-        places = at(self._around.places)  # counted from the start token; the last is none
+        places = at(self._places)  # counted from the start token; the last is none
         around = F.pad(self._generated, (1, 0)).index_select(1, places)
         around = torch.where(places < self._length, around, -1)
         return x + self._around.added(around, self._tables)

@@ -56,7 +56,9 @@ def attend(
     return torch.cat(mixed, -2)
 
 
+# Of the tokens around a position: how many lines (rows of the grid, or columns of a window) on, and how many in a line.
 _AROUND = ((0, -2), (0, -3), *((-1, right) for right in range(-2, 3)), (-2, -1), (-2, 0), (-2, 1), (-3, 0))
+_AHEAD = ((1, -1), (1, 0), (1, 1), (2, 0), (3, 0))  # where a scan ends, those of its beginning
 _AROUND_IF_SHARED = 0.3  # of the usual first weights of the tokens around, since shared embeddings begin longer
 _WINDOWS_AT_MOST = 64  # of a scan: beyond, each column is learned many times over
 _LAYERS_AT_MOST = 1000  # of the largest language models about a hundred
@@ -170,51 +172,76 @@ class TokensAround(nn.Module):
         grid_size: rows and columns of the grid, whose tokens come row by row. In a window, whose tokens come column by
             column, these are its columns and rows.
         width: length of the vector that stands for a token.
-        wraps: whether the last column lies beside the first.
+        turn: number of columns of the whole grid, whose last lies beside the first, where sequences are windows of it;
+            0 where the grid is one sequence.
+        wraps: whether the last column of a grid that is one sequence lies beside the first.
 
     Source:
         van den Oord et al., Pixel Recurrent Neural Networks, 2016, for the neighbours that come before a pixel.
     """
 
-    places: Tensor
+    _places: Tensor
 
-    def __init__(self, grid_size: tuple[int, int], width: int, wraps: bool) -> None:
+    def __init__(self, grid_size: tuple[int, int], width: int, turn: int = 0, wraps: bool = False) -> None:
         super().__init__()
-        self.maps = nn.Parameter(torch.randn(len(_AROUND), width, width) * width**-0.5)
-        # Of each position, the places of its neighbours in a sequence that begins with the start token.
-        row, column = torch.arange(grid_size[0])[:, None, None], torch.arange(grid_size[1])[:, None]
-        down, right = torch.tensor(_AROUND).unbind(1)
-        beyond = (column + right < 0) | (column + right >= grid_size[1])
-        absent = (row + down < 0) | (beyond & ((down == 0) | (not wraps)))
-        place = (row + down) * grid_size[1] + (column + right) % grid_size[1] + 1
-        places = torch.where(absent, math.prod(grid_size), place).flatten(0, 1)
-        self.register_buffer("places", places, persistent=False)
+        self._grid_size, self._turn, self._wraps = grid_size, turn, wraps
+        self._offsets = _AROUND + (_AHEAD if turn else ())
+        self.maps = nn.Parameter(torch.randn(len(self._offsets), width, width) * width**-0.5)
+        self.register_buffer("_places", self._places_in(torch.arange(grid_size[0])), persistent=False)
+
+    def places(self, columns: Int[Tensor, "*B W"] | None) -> Int[Tensor, "*B T N"]:
+        """Return of each position the places of its neighbours in a sequence that begins with the start token.
+
+        A place beyond the sequence is none.
+
+        Args:
+            columns: numbers in the grid of the columns of windows; None where the grid is one sequence.
+        """
+        return self._places if columns is None else self._places_in(columns.to(self._places.device))
+
+    def _places_in(self, lines: Int[Tensor, "*B L"]) -> Int[Tensor, "*B T N"]:
+        length, across = self._grid_size
+        on, right = torch.tensor(self._offsets, device=lines.device).unbind(1)
+        wanted = lines[..., None] + on
+        is_line = lines[..., None, None, :] == (wanted % self._turn if self._turn else wanted)[..., None]
+        line = is_line.int().argmax(-1)  # in the sequence; 0 if there is none, which `found` tells
+        found = is_line.any(-1) & ((on == 0) | (line < torch.arange(length, device=lines.device)[:, None]))
+        other = torch.arange(across, device=lines.device)[:, None] + right
+        beyond = (other < 0) | (other >= across)
+        absent = ~found[..., None, :] | (beyond & ((on == 0) | (not self._wraps)))
+        place = line[..., None, :] * across + other % across + 1
+        return torch.where(absent, length * across, place).flatten(-3, -2)
 
     def tables(self, embedding: Float[Tensor, "K C"]) -> Float[Tensor, "R C"]:
         """Return what every token adds at every place around, and last 0 for a place outside of the grid."""
         mapped = torch.einsum("kc,ncd->nkd", embedding, self.maps).flatten(0, 1).to(embedding.dtype)
         return torch.cat((mapped, mapped.new_zeros(1, mapped.shape[1])))
 
-    def forward(self, tokens: Int[Tensor, "B T"], embedding: Float[Tensor, "K C"]) -> Float[Tensor, "B T C"]:
+    def forward(
+        self, tokens: Int[Tensor, "B T"], embedding: Float[Tensor, "K C"], columns: Int[Tensor, "*B W"] | None = None
+    ) -> Float[Tensor, "B T C"]:
         """Return what is added at each position of sequences that begin with the start token.
 
         Codes are mapped once where there are fewer of them than tokens; else the tokens are.
         """
-        around = self.around(tokens)
+        around = self.around(tokens, self.places(columns))
         if tokens.numel() > len(embedding):
             return self.added(around, self.tables(embedding))
         vectors = F.pad(as_in_products(embedding), (0, 0, 0, 1))
         read = F.embedding(torch.where(around < 0, len(embedding), around), vectors)
         return (read.flatten(-2) @ self.maps.flatten(0, 1)).to(embedding.dtype)
 
-    def around(self, tokens: Int[Tensor, "B T"]) -> Int[Tensor, "B T N"]:
-        """Return the tokens around each position of sequences that begin with the start token; -1 is none."""
-        known = F.pad(tokens, (0, len(self.places) + 1 - tokens.shape[1]), value=-1)
-        return known[:, self.places[: tokens.shape[1]]]
+    def around(self, tokens: Int[Tensor, "B T"], places: Int[Tensor, "*B P N"]) -> Int[Tensor, "B T N"]:
+        """Return the tokens at the places around each position of sequences that begin with the start token, or -1."""
+        count, length = tokens.shape
+        known = F.pad(tokens, (0, places.shape[-2] + 1 - length), value=-1)
+        places = places[..., :length, :].expand(count, -1, -1)
+        return known.gather(1, places.flatten(1)).view_as(places)
 
     def added(self, around: Int[Tensor, "*B N"], tables: Float[Tensor, "R C"]) -> Float[Tensor, "*B C"]:
         """Return the sum over the tokens around; -1 is none."""
-        offsets = torch.arange(len(_AROUND), device=around.device) * (len(tables) // len(_AROUND))
+        count = len(self._offsets)
+        offsets = torch.arange(count, device=around.device) * (len(tables) // count)
         rows = torch.where(around < 0, len(tables) - 1, around + offsets)
         return F.embedding_bag(rows.flatten(0, -2), tables, mode="sum").unflatten(0, around.shape[:-1])
 
@@ -252,8 +279,10 @@ class CausalTransformer(Transformer):
         if windows is not None:
             self.column_emb = nn.Parameter(torch.zeros(1, columns, config.width))
         if config.neighbours:
-            in_order = grid_size if windows is None else (windows.columns, rows)
-            self.around = TokensAround(in_order, config.width, wraps=windows is None)
+            if windows is None:
+                self.around = TokensAround(grid_size, config.width, wraps=True)
+            else:
+                self.around = TokensAround((windows.columns, rows), config.width, turn=columns)
             if self.shared is not None:
                 self.around.maps.data *= _AROUND_IF_SHARED
 
@@ -279,7 +308,7 @@ class CausalTransformer(Transformer):
         """Return what the blocks read."""
         embedding = self.embedding()
         x = F.embedding(tokens, embedding) + self.positions(columns)[..., : tokens.shape[1], :]
-        return x if self.around is None else x + self.around(tokens, embedding)
+        return x if self.around is None else x + self.around(tokens, embedding, columns)
 
     def positions(self, columns: Int[Tensor, "*B W"] | None = None) -> Float[Tensor, "*B T C"]:
         """Return what is learned of each position of a sequence, or of windows at these columns of the grid."""

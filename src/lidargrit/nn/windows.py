@@ -11,6 +11,7 @@ from lidargrit.core.errors import ConfigError
 
 _LEAST = 8  # columns of a window, of which one column in so many is one of the grid's first
 _FIRST_SHARE = 0.2  # of the windows that are drawn, those that are the first: there alone nothing stands yet
+_LAST_SHARE = 0.1  # and those that are the last: there alone the scan's end meets its beginning
 
 
 class Window(NamedTuple):
@@ -76,7 +77,9 @@ class Windows:
         """
         last = self.grid_size[1] - (self.columns - self.first)
         starts = torch.randint(self.first + 1, last + 1, (count, 1), generator=rng)
-        is_first = torch.rand((count, 1), generator=rng) < _FIRST_SHARE
+        kind = torch.rand((count, 1), generator=rng)
+        is_first = kind < _FIRST_SHARE
+        starts = torch.where(kind < 1 - _LAST_SHARE, starts, last)
         columns = self._columns(torch.where(is_first, self.first, starts))
         return columns, is_first | (torch.arange(self.columns) >= self.first)
 
