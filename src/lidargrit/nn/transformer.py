@@ -4,7 +4,6 @@ They read whole sequences; ``nn.decoding`` generates token by token with the sam
 reference's state dict (a minGPT), so that published weights load.
 """
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
