@@ -14,8 +14,8 @@ from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import TrainingError
 from lidargrit.data.run_folder import is_run
-from lidargrit.evaluation.compare import Benchmark, as_table
-from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.compare import Comparison, as_table
+from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.generation.presets import load_preset
 from lidargrit.training import check_folder, train, training_flops, with_budget
@@ -53,8 +53,8 @@ def main() -> None:
                 reporting.message(f"{run.name} is left out: {error}")
                 continue
             rows.append(f"{run}:{sampling}" if sampling else str(run))
-    benchmark = Benchmark(options.against, options.count, EvalConfig(metrics=METRICS))
-    print(as_table(run_benchmark(rows, options.out, benchmark)))
+    comparison = Comparison(options.against, options.count, EvalConfig(metrics=METRICS))
+    print(as_table(run_comparison(rows, options.out, comparison)))
 
 
 if __name__ == "__main__":

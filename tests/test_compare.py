@@ -16,8 +16,8 @@ from lidargrit.data.datasets import load
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.evaluation import compare
-from lidargrit.evaluation.compare import Benchmark, as_json, as_table
-from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.compare import Comparison, as_json, as_table
+from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.generation.generator import load_class
@@ -35,31 +35,31 @@ from tiny_runs import MODEL, the_one_line
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
 QUICK = EvalConfig(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
 NARROW = ("model.unet.channels=8", "model.unet.channel_multipliers=[1,1,1,1]", "model.unet.attention_heads=2")
-BENCHMARK = Benchmark("simulated:8:test", 8, QUICK, (*FEW, "seed=3"))
+COMPARISON = Comparison("simulated:8:test", 8, QUICK, (*FEW, "seed=3"))
 
 
 @pytest.fixture(scope="module")
 def one_system(tmp_path_factory):
     """Return the folder of a comparison of one system, which tests copy before they go on with it."""
     folder = tmp_path_factory.mktemp("comparison")
-    run_benchmark(["marginal"], folder, BENCHMARK)
+    run_comparison(["marginal"], folder, COMPARISON)
     return folder
 
 
 def test_systems_are_made_once_and_set_side_by_side(tmp_path):
     systems = ["marginal", "memorised"]
-    scores = run_benchmark(systems, tmp_path, BENCHMARK)
+    scores = run_comparison(systems, tmp_path, COMPARISON)
     table = as_table(scores)
     assert all(name in table for name in systems)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
     assert len(before) == 16
-    assert run_benchmark(systems, tmp_path, BENCHMARK) == scores
+    assert run_comparison(systems, tmp_path, COMPARISON) == scores
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == before
     costs = json.loads((tmp_path / "marginal" / "costs.json").read_text())
     assert costs["training_flops"] == 0
     assert costs["seconds_per_scan"] > 0
     finished = [str(tmp_path / "runs" / "marginal")]
-    again = run_benchmark(finished, tmp_path / "again", replace(BENCHMARK, preset_settings=()))
+    again = run_comparison(finished, tmp_path / "again", replace(COMPARISON, preset_settings=()))
     assert json.loads(again[0].read_text())["scores"][0]["value"] == pytest.approx(
         json.loads(scores[0].read_text())["scores"][0]["value"]
     )
@@ -67,11 +67,11 @@ def test_systems_are_made_once_and_set_side_by_side(tmp_path):
 
 def test_a_run_named_by_dots_has_the_name_of_its_folder(one_system, tmp_path, monkeypatch):
     finished = shutil.copytree(one_system / "runs" / "marginal", tmp_path / "marginal")
-    wanted = replace(BENCHMARK, preset_settings=())
+    wanted = replace(COMPARISON, preset_settings=())
     for here, name in ((finished, "."), (finished / "below", "..")):
         here.mkdir(exist_ok=True)
         monkeypatch.chdir(here)
-        assert run_benchmark([name], tmp_path / "table", wanted) == [tmp_path / "table" / "marginal" / "marginal.json"]
+        assert run_comparison([name], tmp_path / "table", wanted) == [tmp_path / "table" / "marginal" / "marginal.json"]
     assert [path.name for path in (tmp_path / "table").iterdir() if path.is_dir()] == ["marginal"]
 
 
@@ -87,9 +87,9 @@ def test_a_preset_is_trained_once_in_how_many_ways_ever_it_is_drawn_from(tmp_pat
 
 
 def test_samples_that_are_there_are_scored_beside_systems_that_are_made(tmp_path):
-    made = run_benchmark(["memorised"], tmp_path / "first", BENCHMARK)
+    made = run_comparison(["memorised"], tmp_path / "first", COMPARISON)
     samples = str(tmp_path / "first" / "memorised" / "samples")
-    paths = run_benchmark(["marginal", samples], tmp_path / "both", BENCHMARK)
+    paths = run_comparison(["marginal", samples], tmp_path / "both", COMPARISON)
     values = [json.loads(path.read_text())["scores"][0]["value"] for path in (*made, paths[1])]
     assert values[0] == values[1]
     costs = json.loads((paths[1].parent / "costs.json").read_text())
@@ -98,9 +98,9 @@ def test_samples_that_are_there_are_scored_beside_systems_that_are_made(tmp_path
     assert cells[1]["scores"]["scores"][0]["pixel_statistics"] is not None, "of the row marginal, in every file"
     assert cells[1]["system"] in as_table(paths)
     assert cells[1]["system"] in table_page(cells, 0.0)
-    assert json.loads(run_benchmark(["marginal", samples], tmp_path / "both", BENCHMARK)[1].read_text())["verdict"]
+    assert json.loads(run_comparison(["marginal", samples], tmp_path / "both", COMPARISON)[1].read_text())["verdict"]
     with pytest.raises(ConfigError, match="settings of sampling for samples that are there"):
-        run_benchmark([f"{samples}:steps=3"], tmp_path / "wrong", BENCHMARK)
+        run_comparison([f"{samples}:steps=3"], tmp_path / "wrong", COMPARISON)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_samples_that_are_there_are_scored_beside_systems_that_are_made(tmp_path
 )
 def test_wrong_words_are_told_before_anything_is_trained(systems, message, tmp_path):
     with pytest.raises(LidarGritError, match=message):
-        run_benchmark(systems, tmp_path, BENCHMARK)
+        run_comparison(systems, tmp_path, COMPARISON)
     assert not list(tmp_path.rglob("*"))
 
 
@@ -122,28 +122,28 @@ def test_scans_of_another_sensor_are_told_before_anything_is_trained(tmp_path):
     config = DataConfig(train=(), val=(), columns=64, column_stride=8)
     prepared = prepare("simulated:2:test", config, tmp_path / "narrow")
     with pytest.raises(LidarGritError, match="narrow"):
-        run_benchmark(["marginal"], tmp_path / "table", replace(BENCHMARK, reference=str(prepared)))
+        run_comparison(["marginal"], tmp_path / "table", replace(COMPARISON, reference=str(prepared)))
     assert not list((tmp_path / "table").rglob("run.json"))
 
 
 def test_a_run_of_another_sensor_is_told_before_it_is_sampled(tmp_path):
     prepared = prepare("simulated:2:test", DataConfig(columns=64, column_stride=8), tmp_path / "narrow")
-    wanted = replace(BENCHMARK, reference=str(prepared), preset_settings=())
+    wanted = replace(COMPARISON, reference=str(prepared), preset_settings=())
     with pytest.raises(LidarGritError, match="narrow"):
-        run_benchmark(["pretrained"], tmp_path / "table", wanted)
+        run_comparison(["pretrained"], tmp_path / "table", wanted)
     assert not list((tmp_path / "table").rglob("*"))
 
 
 def test_settings_that_a_later_preset_cannot_follow_are_told_before_the_first_system(tmp_path):
-    wrong = replace(BENCHMARK, preset_settings=(*FEW, "training.tokenizer.accumulate=3"))
+    wrong = replace(COMPARISON, preset_settings=(*FEW, "training.tokenizer.accumulate=3"))
     with pytest.raises(ConfigError, match="on 1 processes in 3 parts"):
-        run_benchmark(["pretrained", "lidargrit_demo"], tmp_path, wrong)
+        run_comparison(["pretrained", "lidargrit_demo"], tmp_path, wrong)
     assert not list(tmp_path.rglob("*"))
 
 
 def test_the_reference_is_projected_once_for_all_systems_of_a_sensor(tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
-    run_benchmark(["marginal", "memorised"], tmp_path / "table", replace(BENCHMARK, num_samples=4))
+    run_comparison(["marginal", "memorised"], tmp_path / "table", replace(COMPARISON, num_samples=4))
     assert len(list((tmp_path / "cache").iterdir())) == 3, "train, val and the four scans that are compared"
 
 
@@ -236,20 +236,20 @@ def test_a_budget_counts_what_is_prepared_once(monkeypatch):
 
 
 def test_a_run_of_another_preset_is_not_taken_for_this_one(one_system):
-    other = replace(BENCHMARK, preset_settings=("data.train=simulated:5:train", *BENCHMARK.preset_settings[1:]))
+    other = replace(COMPARISON, preset_settings=("data.train=simulated:5:train", *COMPARISON.preset_settings[1:]))
     with pytest.raises(LidarGritError, match="which holds another run"):
-        run_benchmark(["marginal"], one_system, other)
+        run_comparison(["marginal"], one_system, other)
 
 
 def test_as_many_are_scored_as_were_asked_for(one_system, tmp_path):
     shutil.copytree(one_system, tmp_path, dirs_exist_ok=True)
-    fewer = run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, num_samples=4))
+    fewer = run_comparison(["marginal"], tmp_path, replace(COMPARISON, num_samples=4))
     assert json.loads(fewer[0].read_text())["inputs"]["samples"]["scans_used"] == 4
 
 
 def test_what_all_are_scored_by_is_looked_at_first(tmp_path):
     with pytest.raises(LidarGritError):
-        run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, reference="no such folder"))
+        run_comparison(["marginal"], tmp_path, replace(COMPARISON, reference="no such folder"))
     assert not list(tmp_path.rglob("*"))
     with pytest.raises(LidarGritError, match="nope"):
         replace(QUICK, protocol="nope")
@@ -372,7 +372,7 @@ def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path,
 
     monkeypatch.setattr(compare, "metric_factory", lambda *_args, **_options: no_weights)
     with pytest.raises(LidarGritError, match="no weights"):
-        run_benchmark(["marginal"], tmp_path / "table", BENCHMARK)
+        run_comparison(["marginal"], tmp_path / "table", COMPARISON)
 
 
 def test_json_is_not_written_over_the_table(tmp_path, capsys):
@@ -382,11 +382,11 @@ def test_json_is_not_written_over_the_table(tmp_path, capsys):
 
 def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
     with claim_folder(tmp_path), pytest.raises(OutputError, match=r"which process \d+ on .* is writing"):
-        run_benchmark(["marginal"], tmp_path, BENCHMARK)
+        run_comparison(["marginal"], tmp_path, COMPARISON)
 
 
 def test_a_folder_that_cannot_be_is_refused_before_the_reference_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(compare, "_check_reference", lambda *_: pytest.fail("it read the reference first"))
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="File exists"):
-        run_benchmark(["marginal"], tmp_path / "file", BENCHMARK)
+        run_comparison(["marginal"], tmp_path / "file", COMPARISON)

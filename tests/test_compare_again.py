@@ -7,7 +7,7 @@ import torch
 
 from lidargrit.data.images import RangeImages
 from lidargrit.evaluation import compare
-from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet
@@ -15,7 +15,7 @@ from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.scans.sensors import load_sensor
 from seeded_images import SeededImages
 from seeded_networks import weights
-from test_compare import BENCHMARK
+from test_compare import COMPARISON
 
 SENSOR = load_sensor("vlp16").with_columns(32)
 
@@ -51,10 +51,10 @@ def test_scores_are_computed_again_with_weights_that_came_since(tmp_path, heard)
 
 def test_a_few_samples_are_those_of_the_first_seeds(tmp_path):
     """They were spaced evenly over what an earlier comparison of more had left, unlike those of a system added now."""
-    plain = replace(BENCHMARK, settings=EvalConfig(metrics=("bev_jsd",), resampling=Resampling(halves=0)))
-    run_benchmark(["marginal"], tmp_path / "six", replace(plain, num_samples=6))
+    plain = replace(COMPARISON, settings=EvalConfig(metrics=("bev_jsd",), resampling=Resampling(halves=0)))
+    run_comparison(["marginal"], tmp_path / "six", replace(plain, num_samples=6))
     found = [
-        json.loads(run_benchmark(["marginal"], tmp_path / name, replace(plain, num_samples=3))[0].read_text())
+        json.loads(run_comparison(["marginal"], tmp_path / name, replace(plain, num_samples=3))[0].read_text())
         for name in ("six", "three")
     ]
     six, three = (each["inputs"]["samples"] for each in found)
@@ -65,7 +65,7 @@ def test_a_few_samples_are_those_of_the_first_seeds(tmp_path):
 def test_it_is_told_which_limit_held(tmp_path, monkeypatch, heard):
     def told(folder, **changes):
         heard.clear()
-        run_benchmark(["marginal"], tmp_path / folder, replace(BENCHMARK, **changes))
+        run_comparison(["marginal"], tmp_path / folder, replace(COMPARISON, **changes))
         (line,) = (line for line in heard if "as many are compared" in line)
         return line
 

@@ -1,4 +1,4 @@
-"""What a system of a benchmark costs: measured once, of the weights and the reference of today, and read back."""
+"""What a system of a comparison costs: measured once, of the weights and the reference of today, and read back."""
 
 import json
 from dataclasses import replace
@@ -8,20 +8,20 @@ import pytest
 from lidargrit.core.errors import CheckpointError
 from lidargrit.evaluation import costs
 from lidargrit.evaluation.compare import as_table
-from lidargrit.evaluation.compare import run as run_benchmark
+from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.costs import COSTS, Costs
-from test_compare import BENCHMARK
+from test_compare import COMPARISON
 from test_generator_contract import made
 
 
 def test_bits_are_of_the_reference_of_today_and_a_time_once_measured_stays(tmp_path, monkeypatch):
     measured = iter((1.5, 2.5))
     monkeypatch.setattr(costs, "bits_per_return", lambda generator, scans: next(measured))
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    run_comparison(["marginal"], tmp_path, COMPARISON)
     first = json.loads((tmp_path / "marginal" / "costs.json").read_text())
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)  # nothing new
+    run_comparison(["marginal"], tmp_path, COMPARISON)  # nothing new
     assert json.loads((tmp_path / "marginal" / "costs.json").read_text()) == first
-    scores = run_benchmark(["marginal"], tmp_path, replace(BENCHMARK, reference="simulated:8:val"))
+    scores = run_comparison(["marginal"], tmp_path, replace(COMPARISON, reference="simulated:8:val"))
     second = json.loads((tmp_path / "marginal" / "costs.json").read_text())
     assert (first["bits_per_return"], second["bits_per_return"]) == (1.5, 2.5)
     assert first["seconds_per_scan"] == second["seconds_per_scan"]
@@ -29,12 +29,12 @@ def test_bits_are_of_the_reference_of_today_and_a_time_once_measured_stays(tmp_p
 
 
 def test_the_time_of_many_scans_outlives_that_of_one(tmp_path):
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    run_comparison(["marginal"], tmp_path, COMPARISON)
     path = tmp_path / "marginal" / COSTS
     before = json.loads(path.read_text())
     assert before["scans"] == 8
     (tmp_path / "marginal" / "samples" / "00000003.npz").unlink()
-    run_benchmark(["marginal"], tmp_path, BENCHMARK)
+    run_comparison(["marginal"], tmp_path, COMPARISON)
     assert json.loads(path.read_text())["seconds_per_scan"] == before["seconds_per_scan"]
 
 

@@ -48,11 +48,11 @@ def test_images_are_those_that_the_protocol_wants(number):
     protocol = load_protocol(TABLES[number].protocol)
     wanted = Reproduction(number, "root")
     for system in wanted.systems().values():
-        data = load_preset(system, wanted.benchmark().preset_settings).data
+        data = load_preset(system, wanted.comparison().preset_settings).data
         assert data.load_sensor().same_rays(protocol.load_sensor())
         assert data.projection_variant == protocol.variant
-    assert wanted.benchmark().num_samples == protocol.num_scans
-    assert wanted.benchmark().settings.metrics == ()
+    assert wanted.comparison().num_samples == protocol.num_scans
+    assert wanted.comparison().settings.metrics == ()
 
 
 def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
@@ -83,7 +83,7 @@ def test_settings_that_a_stage_cannot_follow_are_told_before_any_scan(monkeypatc
     monkeypatch.delattr("lidargrit.evaluation.reproduction.load_range_images")
     wrong = Reproduction(3, "simulated", small=True, flops=0.0, settings=("training.tokenizer.accumulate=3",))
     with pytest.raises(ConfigError, match="on 1 processes in 3 parts"):
-        prepare(wrong.benchmark(), [*wrong.systems().values()])
+        prepare(wrong.comparison(), [*wrong.systems().values()])
 
 
 def test_another_number_and_another_place_are_refused(tmp_path, capsys):

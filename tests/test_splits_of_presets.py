@@ -69,10 +69,10 @@ def test_train_val_and_test_share_no_scan_and_no_drive(preset, roots):
 @pytest.mark.parametrize("number", TABLES)
 def test_a_reproduction_takes_the_very_splits_of_its_presets(number):
     wanted = Reproduction(number, "ROOT")
-    assert wanted.benchmark().reference == f"{TABLES[number].data_set}:ROOT:test"
+    assert wanted.comparison().reference == f"{TABLES[number].data_set}:ROOT:test"
     assert "test" in load_protocol(TABLES[number].protocol).splits
     for preset in wanted.systems().values():
-        own, taken = load_preset(preset).data, load_preset(preset, wanted.benchmark().preset_settings).data
+        own, taken = load_preset(preset).data, load_preset(preset, wanted.comparison().preset_settings).data
         for mine, theirs in ((own.train, taken.train), (own.val, taken.val)):
             assert [source.rpartition(":")[2] for source in mine] == [s.rpartition(":")[2] for s in theirs]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings, scan_words
 
 if TYPE_CHECKING:
-    from lidargrit.evaluation.compare import Benchmark
+    from lidargrit.evaluation.compare import Comparison
     from lidargrit.evaluation.reproduction import Reproduction
 
 COMPLETION, COMPLETED = "completion", "completion.json"
@@ -43,20 +43,20 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
     if paper and options.dry_run:
         facts = plan(paper, options.out)
         return plan_as_text(paper, facts), facts, ""
-    systems, benchmark = ([*paper.systems().values()], paper.benchmark()) if paper else _systems(options)
+    systems, comparison = ([*paper.systems().values()], paper.comparison()) if paper else _systems(options)
     if paper:
-        prepare(benchmark, systems)
-    scores = run(systems, options.out, benchmark, options.workers)
-    write_table(options.out, systems, benchmark, scores)
-    write_text(options.out / "table.html", table_page(as_json(scores), benchmark.flops))
+        prepare(comparison, systems)
+    scores = run(systems, options.out, comparison, options.workers)
+    write_table(options.out, systems, comparison, scores)
+    write_text(options.out / "table.html", table_page(as_json(scores), comparison.flops))
     done = f"done: {options.out / 'table.html'} sorts the table in a browser"
     return as_table(scores, options.table, paper.remarks() if paper else ()), as_json(scores), done
 
 
-def _systems(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
+def _systems(options: argparse.Namespace) -> "tuple[list[str], Comparison]":
     from lidargrit.core.errors import ConfigError
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.evaluation.compare import Benchmark
+    from lidargrit.evaluation.compare import Comparison
     from lidargrit.evaluation.evaluate import EvalConfig
     from lidargrit.evaluation.table_folder import read_table
 
@@ -70,11 +70,11 @@ def _systems(options: argparse.Namespace) -> "tuple[list[str], Benchmark]":
                 "--add SYSTEM ... alone: all else is as in the table",
                 "leave them out, or begin a table in another folder",
             )
-        systems, benchmark = read_table(options.out)
-        return [*systems, *(system for system in options.add if system not in systems)], benchmark
+        systems, comparison = read_table(options.out)
+        return [*systems, *(system for system in options.add if system not in systems)], comparison
     chosen = DEFAULTS | given
     reading = DataConfig(**{name: given[name] for name in ("projection", "bad_points", "bad_scans") if name in given})
-    return options.systems, Benchmark(
+    return options.systems, Comparison(
         reference=chosen["reference"],
         num_samples=chosen["count"],
         settings=EvalConfig(chosen["protocol"], tuple(chosen["metrics"]), data=reading),

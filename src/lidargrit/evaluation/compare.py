@@ -48,8 +48,8 @@ _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
 @dataclass(frozen=True)
-class Benchmark:
-    """Settings that all systems of a benchmark share.
+class Comparison:
+    """Settings that all systems of a comparison share.
 
     Args:
         reference: source of real scans on which none of the systems was trained.
@@ -88,7 +88,7 @@ class Benchmark:
         return with_budget(preset, self.flops) if self.flops else preset
 
 
-def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: int = 1) -> list[Path]:
+def run(systems: Sequence[str], folder: Path, comparison: Comparison, processes: int = 1) -> list[Path]:
     """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:
@@ -97,7 +97,7 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: i
             are taken as they are. A preset that occurs with several sampling choices is trained once.
         folder: output folder. It gets a run folder ``runs/PRESET``, and for each system ``SYSTEM/samples``, scores in
             ``SYSTEM/SYSTEM.json`` and ``SYSTEM/costs.json``. Existing results are kept.
-        benchmark: settings that all systems share.
+        comparison: settings that all systems share.
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
     """
     names = [_folder_name(system) for system in systems]
@@ -107,28 +107,28 @@ def run(systems: Sequence[str], folder: Path, benchmark: Benchmark, processes: i
         )
     check_processes(processes)
     # Wrong words and runs of other presets are refused before anything is trained.
-    plans = [_SystemJob.of(system, folder, benchmark) for system in systems]
-    reference = open_source(benchmark.reference, benchmark.settings.data.bad_points)
-    if (benchmark.preset_settings or benchmark.flops) and not any(plan.preset for plan in plans):
+    plans = [_SystemJob.of(system, folder, comparison) for system in systems]
+    reference = open_source(comparison.reference, comparison.settings.data.bad_points)
+    if (comparison.preset_settings or comparison.flops) and not any(plan.preset for plan in plans):
         raise ConfigError("settings or a budget, and no preset", "a preset that they are for", "leave them out")
     by_run: dict[Path, list[_SystemJob]] = {}  # systems of one run one after the other: it is trained once
     for plan in plans:
         by_run.setdefault(plan.run, []).append(plan)
-    _require_a_metric(benchmark.evaluation())
+    _require_a_metric(comparison.evaluation())
     _warn_of_bounds(plans, reference)
     processes = min(processes, len(by_run))  # more would only take cores from one another
     remaining = _Remaining(list(systems))
     with claim_folder(folder):
-        _check_reference(reference, plans, benchmark)
+        _check_reference(reference, plans, comparison)
         if processes == 1:
             for plan in chain.from_iterable(by_run.values()):
-                sampled = _finish([plan], folder, benchmark, reference)
+                sampled = _finish([plan], folder, comparison, reference)
                 remaining.without([plan.system], sampled)
         else:
             with process_pool(processes, partial(_share, processes)) as pool:
                 heard_from = reporting.current().of_process
                 begun = {
-                    pool.submit(_finish_as_process, heard_from(run.name), some, folder, benchmark): some
+                    pool.submit(_finish_as_process, heard_from(run.name), some, folder, comparison): some
                     for run, some in by_run.items()
                 }
                 for done in as_completed(begun):
@@ -151,9 +151,9 @@ def _require_a_metric(settings: EvalConfig) -> None:
     raise errors[0]
 
 
-def _check_reference(reference: Source, plans: "Sequence[_SystemJob]", benchmark: Benchmark) -> None:
+def _check_reference(reference: Source, plans: "Sequence[_SystemJob]", comparison: Comparison) -> None:
     """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
-    config = benchmark.evaluation().data_config()
+    config = comparison.evaluation().data_config()
     sensors = [plan.sensor for plan in plans if plan.sensor is not None]
     for sensor in {json.dumps(sensor.to_json()): sensor for sensor in sensors}.values():
         images = reference.images(sensor, config)
@@ -180,22 +180,24 @@ def _warn_of_bounds(plans: "Sequence[_SystemJob]", reference: Source) -> None:
 
 
 def _finish_as_process(
-    reporter: reporting.Reporter, plans: "Sequence[_SystemJob]", folder: Path, benchmark: Benchmark
+    reporter: reporting.Reporter, plans: "Sequence[_SystemJob]", folder: Path, comparison: Comparison
 ) -> int:
     with reporting.to(reporter):
-        return _finish(plans, folder, benchmark)
+        return _finish(plans, folder, comparison)
 
 
-def _finish(plans: "Sequence[_SystemJob]", folder: Path, benchmark: Benchmark, reference: Source | None = None) -> int:
+def _finish(
+    plans: "Sequence[_SystemJob]", folder: Path, comparison: Comparison, reference: Source | None = None
+) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
-    settings = benchmark.evaluation()
-    reference = reference or open_source(benchmark.reference, settings.data.bad_points)
+    settings = comparison.evaluation()
+    reference = reference or open_source(comparison.reference, settings.data.bad_points)
     for plan in plans:
         name = _folder_name(plan.system)
         reporting.message(f"{name}:")
         if plan.samples is not None:
-            _score_samples(plan.samples, folder / name, benchmark, reference)
+            _score_samples(plan.samples, folder / name, comparison, reference)
             continue
         if plan.card is not None:
             write_json(folder / name / f"{name}.json", plan.card.to_json())
@@ -204,35 +206,35 @@ def _finish(plans: "Sequence[_SystemJob]", folder: Path, benchmark: Benchmark, r
         generator = load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run)
         generator.to(usable_device(""))
         samples = folder / name / "samples"
-        timed = _sample(generator, plan.run, samples, plan.sampling, benchmark)
+        timed = _sample(generator, plan.run, samples, plan.sampling, comparison)
         sampled += timed is not None
         costs = Costs(folder / name / COSTS, weights_sha256(plan.run))
         costs.write(generator, plan.sampling, plan.preset, timed)
         pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings), samples)
         costs.add_bits(generator, pair.reference)
         _score(pair, settings, folder / name / f"{name}.json")
-        _warn_of_limits(pair, benchmark)
+        _warn_of_limits(pair, comparison)
     return sampled
 
 
-def _score_samples(samples: Source, folder: Path, benchmark: Benchmark, reference: Source) -> None:
+def _score_samples(samples: Source, folder: Path, comparison: Comparison, reference: Source) -> None:
     """Score samples that are there, of which neither the costs nor the training are known."""
-    settings = benchmark.evaluation()
+    settings = comparison.evaluation()
     pair = open_pair(samples, reference, settings)
     if samples.folder is not None:
         pair = _of_first_seeds(pair, samples.folder)
     folder.mkdir(parents=True, exist_ok=True)
     Costs(folder / COSTS, samples.weights_sha256).write_unknown()
     _score(pair, settings, folder / f"{folder.name}.json")
-    _warn_of_limits(pair, benchmark)
+    _warn_of_limits(pair, comparison)
 
 
-def _warn_of_limits(pair: EvalPair, benchmark: Benchmark) -> None:
+def _warn_of_limits(pair: EvalPair, comparison: Comparison) -> None:
     """Warn where fewer scans are compared than were asked for: systems of other numbers get another table."""
-    compared, protocol = len(pair.samples), benchmark.settings.protocol
-    if compared == benchmark.num_samples:
+    compared, protocol = len(pair.samples), comparison.settings.protocol
+    if compared == comparison.num_samples:
         return
-    if compared == load_protocol(protocol).scans_at_most(benchmark.num_samples):
+    if compared == load_protocol(protocol).scans_at_most(comparison.num_samples):
         limit = f"protocol {protocol} takes"
     else:
         few = pair.samples if len(pair.samples.images) == compared else pair.reference
@@ -317,7 +319,7 @@ class _SystemJob:
     card: Scorecard | None = None
 
     @classmethod
-    def of(cls, system: str, folder: Path, benchmark: Benchmark) -> "_SystemJob":
+    def of(cls, system: str, folder: Path, comparison: Comparison) -> "_SystemJob":
         if system.endswith(_SCORES):
             path, taken = Path(system), folder / _folder_name(system) / f"{_folder_name(system)}{_SCORES}"
             there = taken if taken.is_file() and not path.is_file() else path
@@ -333,20 +335,20 @@ class _SystemJob:
                 got = f"{system}, settings of sampling for samples that are there"
                 raise ConfigError(got, "a folder of samples alone", "leave the settings out")
             return cls(system, run, None, None, held.sensor, held)
-        preset = benchmark.preset(name, check=not is_run(trained))
+        preset = comparison.preset(name, check=not is_run(trained))
         sampling = load_class(preset.generator).parse_sampling(settings)
         check_folder(trained, preset)
         return cls(system, trained, preset, sampling, preset.data.load_sensor())
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings | None, benchmark: Benchmark
+    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings | None, comparison: Comparison
 ) -> tuple[int, float] | None:
     """Sample what is not there yet, and return how many scans and the seconds for each; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0
     begun = time.perf_counter()
-    write_samples(generator, run, folder, range(benchmark.num_samples), sampling)
-    sampled = benchmark.num_samples - before
+    write_samples(generator, run, folder, range(comparison.num_samples), sampling)
+    sampled = comparison.num_samples - before
     return (sampled, (time.perf_counter() - begun) / sampled) if sampled > 0 else None
 
 

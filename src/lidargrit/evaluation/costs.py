@@ -1,4 +1,4 @@
-"""What a system of a benchmark costs: parameters, operations, time and bits → costs.json → a table."""
+"""What a system of a comparison costs: parameters, operations, time and bits → costs.json → a table."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -9,7 +9,7 @@ from typing import Any
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
-from lidargrit.evaluation.compare import Benchmark
+from lidargrit.evaluation.compare import Comparison
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.protocols import load_protocol
@@ -133,7 +133,7 @@ class Reproduction:
         rows = [f"the paper's row {row!r} is measured by {system}" for row, system in self.systems().items()]
         return [*rows, *self.table.remarks]
 
-    def benchmark(self) -> Benchmark:
+    def comparison(self) -> Comparison:
         """Return what all rows have in common."""
         protocol = load_protocol(self.table.protocol)
         count = self.count or (_SMALL_COUNT if self.small else protocol.num_scans)
@@ -143,7 +143,7 @@ class Reproduction:
         images = () if self.root == SIMULATED else images
         metrics = tuple(c.metric for c in protocol.metrics if not load_metric(c.metric).needs_weights)
         flops = self.flops if self.flops is not None else _SMALL_FLOPS if self.small else 0.0
-        return Benchmark(
+        return Comparison(
             reference=f"simulated:{count}:test" if self.root == SIMULATED else self.source("test"),
             num_samples=count,
             settings=EvalConfig(protocol=self.table.protocol, metrics=metrics if self.small else ()),
@@ -159,20 +159,20 @@ class Reproduction:
         return f"{self.table.data_set}:{self.root}:{split}"
 
 
-def prepare(benchmark: Benchmark, systems: Sequence[str]) -> None:
+def prepare(comparison: Comparison, systems: Sequence[str]) -> None:
     """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
-    open_source(benchmark.reference)  # refuses a split that is not there
-    for data in [benchmark.preset(system).data for system in systems]:
+    open_source(comparison.reference)  # refuses a split that is not there
+    for data in [comparison.preset(system).data for system in systems]:
         load_range_images(data.train, data)
         load_range_images(data.val, data)
 
 
 def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     """Return the steps of a reproduction and their costs, as plain values."""
-    benchmark = wanted.benchmark()
-    presets = {system: benchmark.preset(system) for system in wanted.systems().values()}
+    comparison = wanted.comparison()
+    presets = {system: comparison.preset(system) for system in wanted.systems().values()}
     data = next(iter(presets.values())).data
-    counted = {source: len(open_source(source).scans()) for source in (*data.train, *data.val, benchmark.reference)}
+    counted = {source: len(open_source(source).scans()) for source in (*data.train, *data.val, comparison.reference)}
     systems = {}
     for system, preset in presets.items():
         run = folder / "runs" / system
@@ -180,9 +180,9 @@ def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
         systems[system] = {
             "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
             "plan": plan_training(preset).to_json(),
-            "sampling_flops": generator.cost().flops * benchmark.num_samples,
+            "sampling_flops": generator.cost().flops * comparison.num_samples,
         }
-    return {"table": wanted.number, "prepare": counted, "samples": benchmark.num_samples, "systems": systems}
+    return {"table": wanted.number, "prepare": counted, "samples": comparison.num_samples, "systems": systems}
 
 
 def plan_as_text(wanted: Reproduction, facts: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""The folder of a benchmark: settings, costs and scores of all systems ⇄ table.json, which can be extended."""
+"""The folder of a comparison: settings, costs and scores of all systems ⇄ table.json, which can be extended."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,20 +7,20 @@ from typing import Any
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json, write_json
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.evaluation.compare import Benchmark, as_json
+from lidargrit.evaluation.compare import Comparison, as_json
 from lidargrit.evaluation.evaluate import EvalConfig
 
 TABLE = "table.json"
 _CURE = "name the systems and settings once more: lidargrit compare OUT SYSTEM ..."
 
 
-def write_table(folder: Path, systems: Sequence[str], benchmark: Benchmark, scores: Sequence[Path]) -> None:
+def write_table(folder: Path, systems: Sequence[str], comparison: Comparison, scores: Sequence[Path]) -> None:
     """Write ``table.json``, with every cell of the table; :func:`read_table` reads it."""
-    settings = _settings(benchmark)
+    settings = _settings(comparison)
     write_json(folder / TABLE, {"systems": list(systems), "settings": settings, "cells": as_json(scores)})
 
 
-def read_table(folder: Path) -> tuple[list[str], Benchmark]:
+def read_table(folder: Path) -> tuple[list[str], Comparison]:
     """Return the systems of a folder and the settings under which they were compared."""
     if not (folder / TABLE).is_file():
         raise ConfigError(f"{folder}, which holds no {TABLE}", "the folder of a finished comparison", _CURE)
@@ -29,7 +29,7 @@ def read_table(folder: Path) -> tuple[list[str], Benchmark]:
         systems, settings = [str(system) for system in data["systems"]], data["settings"]
         how = {"projection": "sensor", **settings["evaluation"]}  # which names only another one
         reading = DataConfig(**{name: how[name] for name in ("projection", "bad_points", "bad_scans")})
-        benchmark = Benchmark(
+        comparison = Comparison(
             str(settings["reference"]),
             int(settings["num_samples"]),
             EvalConfig(str(settings["protocol"]), tuple(map(str, settings["metrics"])), data=reading),
@@ -38,18 +38,18 @@ def read_table(folder: Path) -> tuple[list[str], Benchmark]:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"{folder / TABLE}, which cannot be used ({error})", "what compare wrote", _CURE) from None
-    if _settings(benchmark) != settings:
+    if _settings(comparison) != settings:
         raise ConfigError(f"{folder / TABLE}, made with settings that no option names", "those of the command", _CURE)
-    return systems, benchmark
+    return systems, comparison
 
 
-def _settings(benchmark: Benchmark) -> dict[str, Any]:
+def _settings(comparison: Comparison) -> dict[str, Any]:
     return {
-        "reference": benchmark.reference,
-        "num_samples": benchmark.num_samples,
-        "protocol": benchmark.settings.protocol,
-        "metrics": list(benchmark.settings.metrics),
-        "preset_settings": list(benchmark.preset_settings),
-        "flops": benchmark.flops,
-        "evaluation": benchmark.settings.facts(),
+        "reference": comparison.reference,
+        "num_samples": comparison.num_samples,
+        "protocol": comparison.settings.protocol,
+        "metrics": list(comparison.settings.metrics),
+        "preset_settings": list(comparison.preset_settings),
+        "flops": comparison.flops,
+        "evaluation": comparison.settings.facts(),
     }

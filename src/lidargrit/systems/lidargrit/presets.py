@@ -223,6 +223,8 @@ PRESETS = {
             ),
             replace(
                 shared.PIXEL_DECODER,
+                coarsest_cell=16,
+                column_halvings=2,
                 mask_features=6,
                 coarse_range_width=48,
                 decoded_components=True,
@@ -233,7 +235,7 @@ PRESETS = {
         ),
         tokenizer=replace(_RELAYED, scans=10_000, learning_rate=2e-3, augmentations=("flip",)),
         transformer=replace(_RELAYED, scans=100_000, optimiser="muon", learning_rate=3e-3),
-        pixels=_RELAYED,
+        pixels=replace(_RELAYED, optimiser="muon", learning_rate=2e-3),
     ),
     "lidargrit_demo": preset(
         "LidarGRIT, demo: the small model for a few minutes",
