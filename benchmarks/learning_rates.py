@@ -14,7 +14,7 @@ from lidargrit.core import reporting
 from lidargrit.core.configuration import override
 from lidargrit.core.errors import TrainingError
 from lidargrit.data.run_folder import is_run
-from lidargrit.evaluation.compare import Comparison, as_table
+from lidargrit.evaluation.compare import CompareConfig, as_table
 from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.generation.presets import load_preset
@@ -53,7 +53,7 @@ def main() -> None:
                 reporting.message(f"{run.name} is left out: {error}")
                 continue
             rows.append(f"{run}:{sampling}" if sampling else str(run))
-    comparison = Comparison(options.against, options.count, EvalConfig(metrics=METRICS))
+    comparison = CompareConfig(options.against, options.count, EvalConfig(metrics=METRICS))
     print(as_table(run_comparison(rows, options.out, comparison)))
 
 

@@ -16,7 +16,7 @@ from lidargrit.data.datasets import load
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.evaluation import compare
-from lidargrit.evaluation.compare import Comparison, as_json, as_table
+from lidargrit.evaluation.compare import CompareConfig, as_json, as_table
 from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.intervals import Resampling
@@ -35,7 +35,7 @@ from tiny_runs import MODEL, the_one_line
 FEW = ("data.train=simulated:6:train", "data.val=simulated:2:val", "data.columns=512", "data.column_stride=8")
 QUICK = EvalConfig(metrics=("bev_jsd",), resampling=Resampling(groups=4, halves=2))
 NARROW = ("model.unet.channels=8", "model.unet.channel_multipliers=[1,1,1,1]", "model.unet.attention_heads=2")
-COMPARISON = Comparison("simulated:8:test", 8, QUICK, (*FEW, "seed=3"))
+COMPARISON = CompareConfig("simulated:8:test", 8, QUICK, (*FEW, "seed=3"))
 
 
 @pytest.fixture(scope="module")

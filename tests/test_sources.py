@@ -24,7 +24,7 @@ from lidargrit.data.sources import (
     open_source,
 )
 from lidargrit.data.sources.image_files import ImageFileSource
-from lidargrit.evaluation.compare import Comparison
+from lidargrit.evaluation.compare import CompareConfig
 from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.inference.samples import write_samples
@@ -146,7 +146,7 @@ def test_numbers_too_large_are_refused_before_any_work():
     with pytest.raises(ConfigError, match="a seed from 0 to"):
         EvalConfig(seed=2**64)
     with pytest.raises(ConfigError, match="100000000000000000000 samples"):
-        Comparison("simulated:2:test", 10**20)
+        CompareConfig("simulated:2:test", 10**20)
 
 
 @pytest.mark.parametrize("name", ["~nobody-of-that-name/x", "x" * 5000, "x/" * 3000, "no such folder"])

@@ -122,22 +122,30 @@ def test_the_first_columns_reach_the_last(transformer):
     assert float(moved[..., -1].max()) > 1e-4
 
 
-@pytest.mark.parametrize("start", [2, 9, 14])
-def test_tokens_around_a_position_are_those_beside_it_in_the_turn_that_come_before_it(start):
-    columns, around, none = [0, *range(start, start + 7)], TokensAround((8, 4), 3, turn=21), 32
+@pytest.mark.parametrize(("turn", "starts"), [(21, (2, 9, 12, 13, 14)), (9, (1, 2))])
+def test_tokens_around_a_position_are_those_beside_it_in_the_turn_that_come_before_it(turn, starts):
+    windows, around, none = [[0, *range(start, start + 7)] for start in starts], TokensAround((8, 4), 3, turn), 32
     beside = [(0, -2), (0, -3), (-1, -2), (-1, -1), (-1, 0), (-1, 1), (-1, 2), (-2, -1), (-2, 0), (-2, 1), (-3, 0)]
     beside += [(1, -1), (1, 0), (1, 1), (2, 0), (3, 0)]
-    wanted = []
-    for place, column in enumerate(columns):
-        for row in range(4):
-            for right, down in beside:
-                there = (column + right) % 21
-                before = there in columns and (right == 0 or columns.index(there) < place)
-                known = before and 0 <= row + down < 4
-                wanted.append(4 * columns.index(there) + row + down + 1 if known else none)
-    assert around.places(torch.tensor([columns] * 2)).flatten(1).tolist() == [wanted] * 2
-    ahead = around.places(torch.tensor(columns))[-4:, 11:] != none
-    assert bool(ahead.any()) == (start == 14), "only the last window ends where the scan begins"
+    for columns, found in zip(windows, around.places(torch.tensor(windows)), strict=True):
+        wanted = []
+        for place, column in enumerate(columns):
+            for row in range(4):
+                for right, down in beside:
+                    there = (column + right) % turn
+                    before = there in columns and (right == 0 or columns.index(there) < place)
+                    known = before and 0 <= row + down < 4
+                    wanted.append(4 * columns.index(there) + row + down + 1 if known else none)
+        assert found.flatten().tolist() == wanted
+        ahead = found[-4:, 11:] != none
+        assert bool(ahead.any()) == (columns[-1] + 3 >= turn), "the scan's last columns know its first"
+
+
+def test_what_graphs_of_a_gpu_read_stays_at_its_place(transformer):
+    decoder = CachedDecoder(transformer, 1, lambda *given: sample_token(*given, TokenSampling()), static=True)
+    places = [each.data_ptr() for each in (decoder._places, decoder._positions)]
+    decoder.generate(torch.rand((1, 84), generator=torch.Generator().manual_seed(1)))
+    assert [each.data_ptr() for each in (decoder._places, decoder._positions)] == places
 
 
 def small_system(columns=512):
@@ -176,6 +184,8 @@ def test_training_learns_windows_and_validation_the_whole_scan():
 
 def test_a_training_reads_as_many_windows_of_each_scan_as_are_asked_for_and_counts_each_alike():
     generator = small_system()
+    for weight in (generator.transformer.tok_emb.weight, generator.transformer.around.maps):
+        torch.nn.init.normal_(weight, std=0.5)  # so that windows that are mistaken for one another are seen
     generator.transformer.config = replace(generator.transformer.config, windows_per_scan=3)
     images = two_images(generator.sensor)
     objective = generator.transformer_objective().train()

@@ -215,7 +215,7 @@ def test_operations_of_a_head_are_those_that_torch_counts():
 
 def test_tokens_around_are_the_same_mapped_by_code_and_by_token():
     torch.manual_seed(0)
-    around, embedding = TokensAround((4, 6), 8, wraps=True), torch.randn(24, 8)
+    around, embedding = TokensAround((4, 6), 8), torch.randn(24, 8)
     tokens, found = torch.randint(24, (1, 24)), []
     for enabled in (False, True):
         with torch.autocast("cpu", torch.bfloat16, enabled=enabled):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from lidargrit.cli._options import SCANS, refuse_unused, scan_settings, scan_words
 
 if TYPE_CHECKING:
-    from lidargrit.evaluation.compare import Comparison
+    from lidargrit.evaluation.compare import CompareConfig
     from lidargrit.evaluation.reproduction import Reproduction
 
 COMPLETION, COMPLETED = "completion", "completion.json"
@@ -53,10 +53,10 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
     return as_table(scores, options.table, paper.remarks() if paper else ()), as_json(scores), done
 
 
-def _systems(options: argparse.Namespace) -> "tuple[list[str], Comparison]":
+def _systems(options: argparse.Namespace) -> "tuple[list[str], CompareConfig]":
     from lidargrit.core.errors import ConfigError
     from lidargrit.data.prepared.config import DataConfig
-    from lidargrit.evaluation.compare import Comparison
+    from lidargrit.evaluation.compare import CompareConfig
     from lidargrit.evaluation.evaluate import EvalConfig
     from lidargrit.evaluation.table_folder import read_table
 
@@ -74,7 +74,7 @@ def _systems(options: argparse.Namespace) -> "tuple[list[str], Comparison]":
         return [*systems, *(system for system in options.add if system not in systems)], comparison
     chosen = DEFAULTS | given
     reading = DataConfig(**{name: given[name] for name in ("projection", "bad_points", "bad_scans") if name in given})
-    return options.systems, Comparison(
+    return options.systems, CompareConfig(
         reference=chosen["reference"],
         num_samples=chosen["count"],
         settings=EvalConfig(chosen["protocol"], tuple(chosen["metrics"]), data=reading),

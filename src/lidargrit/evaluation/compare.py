@@ -48,7 +48,7 @@ _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
 @dataclass(frozen=True)
-class Comparison:
+class CompareConfig:
     """Settings that all systems of a comparison share.
 
     Args:
@@ -88,7 +88,7 @@ class Comparison:
         return with_budget(preset, self.flops) if self.flops else preset
 
 
-def run(systems: Sequence[str], folder: Path, comparison: Comparison, processes: int = 1) -> list[Path]:
+def run(systems: Sequence[str], folder: Path, comparison: CompareConfig, processes: int = 1) -> list[Path]:
     """Train or load each system, sample from it and score the samples, and return the files of scores.
 
     Args:
@@ -151,7 +151,7 @@ def _require_a_metric(settings: EvalConfig) -> None:
     raise errors[0]
 
 
-def _check_reference(reference: Source, plans: "Sequence[_SystemJob]", comparison: Comparison) -> None:
+def _check_reference(reference: Source, plans: "Sequence[_SystemJob]", comparison: CompareConfig) -> None:
     """Project the reference for every sensor, and refuse one of other rays, before anything is trained."""
     config = comparison.evaluation().data_config()
     sensors = [plan.sensor for plan in plans if plan.sensor is not None]
@@ -180,14 +180,14 @@ def _warn_of_bounds(plans: "Sequence[_SystemJob]", reference: Source) -> None:
 
 
 def _finish_as_process(
-    reporter: reporting.Reporter, plans: "Sequence[_SystemJob]", folder: Path, comparison: Comparison
+    reporter: reporting.Reporter, plans: "Sequence[_SystemJob]", folder: Path, comparison: CompareConfig
 ) -> int:
     with reporting.to(reporter):
         return _finish(plans, folder, comparison)
 
 
 def _finish(
-    plans: "Sequence[_SystemJob]", folder: Path, comparison: Comparison, reference: Source | None = None
+    plans: "Sequence[_SystemJob]", folder: Path, comparison: CompareConfig, reference: Source | None = None
 ) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
@@ -217,7 +217,7 @@ def _finish(
     return sampled
 
 
-def _score_samples(samples: Source, folder: Path, comparison: Comparison, reference: Source) -> None:
+def _score_samples(samples: Source, folder: Path, comparison: CompareConfig, reference: Source) -> None:
     """Score samples that are there, of which neither the costs nor the training are known."""
     settings = comparison.evaluation()
     pair = open_pair(samples, reference, settings)
@@ -229,7 +229,7 @@ def _score_samples(samples: Source, folder: Path, comparison: Comparison, refere
     _warn_of_limits(pair, comparison)
 
 
-def _warn_of_limits(pair: EvalPair, comparison: Comparison) -> None:
+def _warn_of_limits(pair: EvalPair, comparison: CompareConfig) -> None:
     """Warn where fewer scans are compared than were asked for: systems of other numbers get another table."""
     compared, protocol = len(pair.samples), comparison.settings.protocol
     if compared == comparison.num_samples:
@@ -319,7 +319,7 @@ class _SystemJob:
     card: Scorecard | None = None
 
     @classmethod
-    def of(cls, system: str, folder: Path, comparison: Comparison) -> "_SystemJob":
+    def of(cls, system: str, folder: Path, comparison: CompareConfig) -> "_SystemJob":
         if system.endswith(_SCORES):
             path, taken = Path(system), folder / _folder_name(system) / f"{_folder_name(system)}{_SCORES}"
             there = taken if taken.is_file() and not path.is_file() else path
@@ -342,7 +342,7 @@ class _SystemJob:
 
 
 def _sample(
-    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings | None, comparison: Comparison
+    generator: Generator, run: Path, folder: Path, sampling: SamplingSettings | None, comparison: CompareConfig
 ) -> tuple[int, float] | None:
     """Sample what is not there yet, and return how many scans and the seconds for each; None if all was there."""
     before = len(list(folder.glob("[!.]*.npz"))) if folder.is_dir() else 0

@@ -9,7 +9,7 @@ from typing import Any
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
-from lidargrit.evaluation.compare import Comparison
+from lidargrit.evaluation.compare import CompareConfig
 from lidargrit.evaluation.evaluate import EvalConfig
 from lidargrit.evaluation.metrics import load_metric
 from lidargrit.evaluation.protocols import load_protocol
@@ -133,7 +133,7 @@ class Reproduction:
         rows = [f"the paper's row {row!r} is measured by {system}" for row, system in self.systems().items()]
         return [*rows, *self.table.remarks]
 
-    def comparison(self) -> Comparison:
+    def comparison(self) -> CompareConfig:
         """Return what all rows have in common."""
         protocol = load_protocol(self.table.protocol)
         count = self.count or (_SMALL_COUNT if self.small else protocol.num_scans)
@@ -143,7 +143,7 @@ class Reproduction:
         images = () if self.root == SIMULATED else images
         metrics = tuple(c.metric for c in protocol.metrics if not load_metric(c.metric).needs_weights)
         flops = self.flops if self.flops is not None else _SMALL_FLOPS if self.small else 0.0
-        return Comparison(
+        return CompareConfig(
             reference=f"simulated:{count}:test" if self.root == SIMULATED else self.source("test"),
             num_samples=count,
             settings=EvalConfig(protocol=self.table.protocol, metrics=metrics if self.small else ()),
@@ -159,7 +159,7 @@ class Reproduction:
         return f"{self.table.data_set}:{self.root}:{split}"
 
 
-def prepare(comparison: Comparison, systems: Sequence[str]) -> None:
+def prepare(comparison: CompareConfig, systems: Sequence[str]) -> None:
     """Project all training scans before anything is trained: one that cannot be used is refused now, not after days."""
     open_source(comparison.reference)  # refuses a split that is not there
     for data in [comparison.preset(system).data for system in systems]:

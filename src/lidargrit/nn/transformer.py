@@ -55,7 +55,7 @@ def attend(
     return torch.cat(mixed, -2)
 
 
-# Of the tokens around a position: how many lines (rows of the grid, or columns of a window) on, and how many in a line.
+# Offsets to the tokens around a position: lines (rows of the grid, or columns of a window), then places within a line.
 _AROUND = ((0, -2), (0, -3), *((-1, right) for right in range(-2, 3)), (-2, -1), (-2, 0), (-2, 1), (-3, 0))
 _AHEAD = ((1, -1), (1, 0), (1, 1), (2, 0), (3, 0))  # where a scan ends, those of its beginning
 _AROUND_IF_SHARED = 0.3  # of the usual first weights of the tokens around, since shared embeddings begin longer
@@ -164,28 +164,30 @@ class Transformer(Network):
 class TokensAround(nn.Module):
     """What the tokens around a position add to its embedding, each by a linear map of its own.
 
-    They are those of the grid up to three rows above and three columns to the left. The next token depends on these
-    most, and a short training finds that sooner than by attention over learned positions.
+    They are those beside it on the grid, up to three rows or columns away, that come before it in the sequence: in a
+    window also the scan's first columns, where its last ones meet them. The next token depends on these most, and a
+    short training finds that sooner than by attention over learned positions.
 
     Args:
         grid_size: rows and columns of the grid, whose tokens come row by row. In a window, whose tokens come column by
             column, these are its columns and rows.
         width: length of the vector that stands for a token.
         turn: number of columns of the whole grid, whose last lies beside the first, where sequences are windows of it;
-            0 where the grid is one sequence.
-        wraps: whether the last column of a grid that is one sequence lies beside the first.
+            0 where the grid is one sequence, which turns within its rows.
 
     Source:
         van den Oord et al., Pixel Recurrent Neural Networks, 2016, for the neighbours that come before a pixel.
     """
 
+    _offsets: Tensor
     _places: Tensor
 
-    def __init__(self, grid_size: tuple[int, int], width: int, turn: int = 0, wraps: bool = False) -> None:
+    def __init__(self, grid_size: tuple[int, int], width: int, turn: int = 0) -> None:
         super().__init__()
-        self._grid_size, self._turn, self._wraps = grid_size, turn, wraps
-        self._offsets = _AROUND + (_AHEAD if turn else ())
-        self.maps = nn.Parameter(torch.randn(len(self._offsets), width, width) * width**-0.5)
+        self._grid_size, self._turn = grid_size, turn
+        offsets = torch.tensor(_AROUND + (_AHEAD if turn else ()))
+        self.maps = nn.Parameter(torch.randn(len(offsets), width, width) * width**-0.5)
+        self.register_buffer("_offsets", offsets, persistent=False)
         self.register_buffer("_places", self._places_in(torch.arange(grid_size[0])), persistent=False)
 
     def places(self, columns: Int[Tensor, "*B W"] | None) -> Int[Tensor, "*B T N"]:
@@ -200,19 +202,19 @@ class TokensAround(nn.Module):
 
     def _places_in(self, lines: Int[Tensor, "*B L"]) -> Int[Tensor, "*B T N"]:
         length, across = self._grid_size
-        on, right = torch.tensor(self._offsets, device=lines.device).unbind(1)
-        wanted = lines[..., None] + on
+        on, right = self._offsets.unbind(1)
+        wanted = lines[..., None] + on  # modulo a turn, which has at least 9 columns, no two of them are the same
         is_line = lines[..., None, None, :] == (wanted % self._turn if self._turn else wanted)[..., None]
-        line = is_line.int().argmax(-1)  # in the sequence; 0 if there is none, which `found` tells
+        line = is_line.int().argmax(-1)  # in the sequence; any if there is none, which `found` tells
         found = is_line.any(-1) & ((on == 0) | (line < torch.arange(length, device=lines.device)[:, None]))
         other = torch.arange(across, device=lines.device)[:, None] + right
         beyond = (other < 0) | (other >= across)
-        absent = ~found[..., None, :] | (beyond & ((on == 0) | (not self._wraps)))
+        absent = ~found[..., None, :] | (beyond & ((on == 0) | bool(self._turn)))
         place = line[..., None, :] * across + other % across + 1
         return torch.where(absent, length * across, place).flatten(-3, -2)
 
     def tables(self, embedding: Float[Tensor, "K C"]) -> Float[Tensor, "R C"]:
-        """Return what every token adds at every place around, and last 0 for a place outside of the grid."""
+        """Return what every token adds at every place around, and last 0 for one that does not come before it."""
         mapped = torch.einsum("kc,ncd->nkd", embedding, self.maps).flatten(0, 1).to(embedding.dtype)
         return torch.cat((mapped, mapped.new_zeros(1, mapped.shape[1])))
 
@@ -222,6 +224,10 @@ class TokensAround(nn.Module):
         """Return what is added at each position of sequences that begin with the start token.
 
         Codes are mapped once where there are fewer of them than tokens; else the tokens are.
+
+        Args:
+            embedding: the vector that stands for each token.
+            columns: numbers in the grid of the columns of windows; None where the grid is one sequence.
         """
         around = self.around(tokens, self.places(columns))
         if tokens.numel() > len(embedding):
@@ -239,7 +245,7 @@ class TokensAround(nn.Module):
 
     def added(self, around: Int[Tensor, "*B N"], tables: Float[Tensor, "R C"]) -> Float[Tensor, "*B C"]:
         """Return the sum over the tokens around; -1 is none."""
-        count = len(self._offsets)
+        count = len(self.maps)
         offsets = torch.arange(count, device=around.device) * (len(tables) // count)
         rows = torch.where(around < 0, len(tables) - 1, around + offsets)
         return F.embedding_bag(rows.flatten(0, -2), tables, mode="sum").unflatten(0, around.shape[:-1])
@@ -278,10 +284,8 @@ class CausalTransformer(Transformer):
         if windows is not None:
             self.column_emb = nn.Parameter(torch.zeros(1, columns, config.width))
         if config.neighbours:
-            if windows is None:
-                self.around = TokensAround(grid_size, config.width, wraps=True)
-            else:
-                self.around = TokensAround((windows.columns, rows), config.width, turn=columns)
+            in_order, turn = (grid_size, 0) if windows is None else ((windows.columns, rows), columns)
+            self.around = TokensAround(in_order, config.width, turn)
             if self.shared is not None:
                 self.around.maps.data *= _AROUND_IF_SHARED
 

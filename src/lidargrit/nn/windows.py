@@ -11,7 +11,7 @@ from lidargrit.core.errors import ConfigError
 
 _LEAST = 8  # columns of a window, of which one column in so many is one of the grid's first
 _FIRST_SHARE = 0.2  # of the windows that are drawn, those that are the first: there alone nothing stands yet
-_LAST_SHARE = 0.1  # and those that are the last: there alone the scan's end meets its beginning
+_LAST_SHARE = 0.1  # and those that are the last: there alone the last column meets the first
 
 
 class Window(NamedTuple):

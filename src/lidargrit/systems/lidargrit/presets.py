@@ -224,7 +224,7 @@ PRESETS = {
             replace(
                 shared.PIXEL_DECODER,
                 coarsest_cell=16,
-                column_halvings=2,
+                column_halvings=2,  # columns are closer than rows
                 mask_features=6,
                 coarse_range_width=48,
                 decoded_components=True,
