@@ -33,7 +33,8 @@ def export_scans(
 
     Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
     names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
-    which scan, and ``sensor.json`` on which rays points lie, if that is known and is not KITTI's HDL-64E.
+    which scan, and ``sensor.json`` on which rays points lie, if that is known and is neither KITTI's HDL-64E nor the
+    sensor of all such files.
 
     Args:
         source: samples of ours or of another program, a prepared folder, or a source of scans.
@@ -61,8 +62,8 @@ def export_scans(
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
-    told_by_format = isinstance(layout, _Flat) and layout.tells_sensor
     sensor = change.other if isinstance(change, Rescan) else scans.sensor()
+    told_by_format = isinstance(layout, _Flat) and sensor is not None and layout.sensor == sensor.name
     with folder.writing("exporting") as progress:
         for index in folder.missing:
             with folder.leaving_out(index):
@@ -156,7 +157,7 @@ class _Flat:
 
     def __init__(self, out: Path, form: type[ScanFormat], suffix: str) -> None:
         self._out, self._form, self._suffix = out, form, suffix
-        self.keeps_labels, self.tells_sensor = "label" in form.keeps, bool(form.sensor)
+        self.keeps_labels, self.sensor = "label" in form.keeps, form.sensor
 
     def files(self, names: list[str]) -> list[str]:
         return [name + self._suffix for name in names]

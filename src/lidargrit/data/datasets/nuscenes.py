@@ -54,7 +54,8 @@ class Nuscenes(FileDataset):
     A sequence is a scene where the tables of the data set lie beside the scans (scene.json, sample.json and log.json in
     ``v1.0-trainval``, ``v1.0-test`` or ``v1.0-mini``), and a log (a drive, the first part of a file's name) where they
     do not. The official splits are by scene and need the tables. A scan belongs to the scene of its log whose samples
-    surround it in time; scans of no scene make a sequence of their log. A folder of .pcd.bin alone is read, too.
+    surround it in time; scans of no scene make a sequence of their log. A folder of .pcd.bin alone is read, too;
+    a file ``sensor.json`` in it describes another sensor.
 
     The scans are corrected for the car's motion, which lifts near points out of their rows by a degree: rows by ring
     (``--set data.projection=unfolding``) hold them all, rows by elevation leave an arc of the ground empty.
@@ -93,6 +94,7 @@ class Nuscenes(FileDataset):
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         self._scenes_of_log = _read_scenes(root)
         super().__init__(root, split, bad_points)
+        self.sensor = self._sensor_beside()
 
     def name(self, index: int) -> str:
         """Name one scan by its file, which has its log and its time."""
