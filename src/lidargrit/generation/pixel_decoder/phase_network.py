@@ -62,7 +62,8 @@ class PixelDecoderConfig(Settings):
         weighed_components: whether all other components are weighed by the probability that the decoded distribution
             gives to ranges near them, so that a wall does not take pixels of a pole; needs ``decoded_components``.
         own_context: share of the scans of training whose earlier ranges the decoder samples itself; beside true ones
-            alone it learns to rely on neighbours more than on the tokens, and samples drift. It doubles the time.
+            alone it learns to rely on neighbours more than on the tokens, and samples drift. It doubles the time, and
+            roughens walls unless a training beside true ones follows.
         any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
             are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
             largest, and smaller images begin with smaller cells.

@@ -229,8 +229,7 @@ PRESETS = {
                 coarse_range_width=48,
                 decoded_components=True,
                 weighed_components=True,
-                own_context=0.5,
-                range_temperature=0.03,  # own_context widens the mixtures
+                range_temperature=0.2,  # for pixels that learn beside true neighbours last
             ),
         ),
         tokenizer=replace(_RELAYED, scans=10_000, learning_rate=2e-3, augmentations=("flip",)),
