@@ -302,13 +302,6 @@ def test_range_images_of_one_sensor_are_not_taken_for_those_of_another(samples, 
     assert not (tmp_path / "none").exists()
 
 
-def test_files_of_a_format_with_a_sensor_of_its_own_tell_another(tmp_path):
-    for name, told in (("vlp16", True), ("hdl32e", False)):
-        export_scans(f"simulated:1@{name}", tmp_path / name, "nuscenes_bin")
-        assert (tmp_path / name / "sensor.json").exists() == told
-        assert load_sensor(open_source(str(tmp_path / name)).scans().sensor).name == name
-
-
 def test_other_formats_and_sources_are_refused(samples, tmp_path):
     for kind in ("plx", "ouster_pcap", "pcap", "", "image"):
         with pytest.raises(UnknownNameError, match="the format") as refused:

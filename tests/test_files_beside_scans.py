@@ -203,3 +203,10 @@ def test_a_sensor_that_is_not_known_is_not_told_and_a_foreign_file_of_that_name_
     of_several.sensors_differ = True
     assert PointScans(of_several, 1).sensor() is None
     assert all(load(name).sensors_differ for name in ("ncore", "py123d", "ouster"))
+
+
+def test_files_of_a_format_with_a_sensor_of_its_own_tell_another(tmp_path):
+    for name, told in (("vlp16", True), ("hdl32e", False)):
+        export_scans(f"simulated:1@{name}", tmp_path / name, "nuscenes_bin")
+        assert (tmp_path / name / "sensor.json").exists() == told
+        assert load_sensor(open_source(str(tmp_path / name)).scans().sensor).name == name
