@@ -184,13 +184,15 @@ def test_a_link_in_place_of_a_file_is_not_taken_as_written(tmp_path, capsys):
     assert "a.pcd, which is a link; wanted a file of this command, or none; remove the link" in capsys.readouterr().err
 
 
-def test_points_of_another_sensor_than_kittis_tell_it_to_who_reads_them_back(tmp_path):
+def test_points_tell_their_sensor_to_who_reads_them_back_unless_it_is_that_of_the_tree(tmp_path):
     for kind in ("ply", "kitti_odometry"):
         assert export_scans("simulated:1@vlp16", tmp_path / kind, kind) == 1
     assert open_source(str(tmp_path / "ply")).sensor.height == 16
     assert open_source(f"kitti_odometry:{tmp_path / 'kitti_odometry'}").sensor.height == 16
-    export_scans("simulated:1", tmp_path / "kittis", "ply")
-    assert not (tmp_path / "kittis" / SENSOR_FILE).exists(), "a tree is read as of this sensor"
+    for kind, told in (("ply", True), ("kitti_odometry", False)):
+        export_scans("simulated:1", tmp_path / "of_kitti" / kind, kind)
+        assert (tmp_path / "of_kitti" / kind / SENSOR_FILE).exists() == told
+        assert open_source(str(tmp_path / "of_kitti" / kind)).sensor.name == "hdl64e_kitti_odometry"
 
 
 def test_a_sensor_that_is_not_known_is_not_told_and_a_foreign_file_of_that_name_does_not_stop_an_export(tmp_path):

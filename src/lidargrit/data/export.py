@@ -15,7 +15,7 @@ from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
 from lidargrit.scans.motion import UndoMotion
 from lidargrit.scans.rescan import Rescan
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import Scan
 
 MANIFEST = "export.json"
@@ -33,8 +33,8 @@ def export_scans(
 
     Scans keep their own points; a range image gives one point for each return, on the ray of its pixel. Files have the
     names of the scans, or ``NNNNNN``, the index, for samples and prepared scans. ``export.json`` says which file holds
-    which scan, and ``sensor.json`` on which rays points lie, if that is known and is neither KITTI's HDL-64E nor the
-    sensor of all such files.
+    which scan, and ``sensor.json`` on which rays points lie, if that is known, unless such files are read
+    as of that sensor anyway.
 
     Args:
         source: samples of ours or of another program, a prepared folder, or a source of scans.
@@ -63,12 +63,12 @@ def export_scans(
     identities = [scans.identity(index) for index in range(len(scans))]
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     sensor = change.other if isinstance(change, Rescan) else scans.sensor()
-    told_by_format = isinstance(layout, _Flat) and sensor is not None and layout.sensor == sensor.name
+    is_read_so = sensor is not None and layout.sensor and load_sensor(layout.sensor).to_json() == sensor.to_json()
     with folder.writing("exporting") as progress:
         for index in folder.missing:
             with folder.leaving_out(index):
                 scan = read(index)
-                if sensor is not None and not told_by_format:  # only now: a folder without any scan is left free
+                if sensor is not None and not is_read_so:  # a folder without any scan is left free
                     folder.tell_sensor(sensor)
                 layout.write(files[index], scan)
                 if scan.label is not None and not layout.keeps_labels:

@@ -26,6 +26,7 @@ from lidargrit.core.files import (
 from lidargrit.core.reporting import Progress
 from lidargrit.core.untrusted import user_path
 from lidargrit.data import formats
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.datasets.shared.files import SENSOR_FILE
 from lidargrit.data.datasets.shared.labels_beside import label_file
 from lidargrit.data.datasets.shared.odometry import write_motions
@@ -201,6 +202,7 @@ class KittiTree:
     """The tree of KITTI odometry, with labels as SemanticKITTI has them."""
 
     keeps_labels = True
+    sensor = KittiOdometry.sensor
 
     def __init__(self, out: Path) -> None:
         self._out = out

@@ -91,6 +91,11 @@ class ScanDataset(ABC):
         """
         return cls.public_name()
 
+    @property
+    def named_sensor(self) -> str:
+        """Name or file of the sensor; "" where neither the data set nor a file beside the scans names it."""
+        return self.sensor
+
     @abstractmethod
     def __len__(self) -> int:
         """Count the scans."""

@@ -7,7 +7,6 @@ from pathlib import Path
 from lidargrit.core import reporting
 from lidargrit.core.errors import DataError, LidarGritError, ScanError, no_usable_scan
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
-from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -55,8 +54,8 @@ class DatasetSource(Source):
 
     @cached_property
     def _sensor_name(self) -> str:
-        if self.data_set != "folder" or self._dataset.sensor != Folder.sensor:
-            return self._dataset.sensor
+        if self._dataset.named_sensor:
+            return self._dataset.named_sensor
         try:
             (scan,), _ = usable_scans(self._dataset, range(len(self._dataset)), at_most=1)
         except ScanError:  # of all of them, and told where they are used

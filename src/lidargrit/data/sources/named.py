@@ -11,7 +11,6 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, OutputError, printable
 from lidargrit.data.datasets import ScanDataset, Window
-from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.formats import read_scan
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -59,7 +58,7 @@ class NamedScans(ABC):
 
     @abstractmethod
     def sensor(self) -> SensorModel | None:
-        """Return the sensor on whose rays the points lie, where it is known and is not KITTI's HDL-64E."""
+        """Return the sensor on whose rays the points lie, where it is known."""
 
     def path(self, index: int) -> Path | None:
         """Return the file that holds the points of a scan; None where there is none."""
@@ -123,10 +122,10 @@ class PointScans(NamedScans):
 
     def sensor(self) -> SensorModel | None:
         """Return the sensor of the data set, unless it may have several or the file that names it is no sensor's."""
-        if self._dataset.sensors_differ or self._dataset.sensor == Folder.sensor:
-            return None
-        with suppress(ConfigError):
-            return load_sensor(self._dataset.sensor)
+        named = self._dataset.named_sensor
+        if named and not self._dataset.sensors_differ:
+            with suppress(ConfigError):
+                return load_sensor(named)
         return None
 
     def path(self, index: int) -> Path | None:
@@ -221,12 +220,9 @@ def first_scan(text: str, config: DataConfig) -> tuple[Scan, str]:
     skips = config.bad_scans == "skip"
     if Path(text).is_file() and not skips:
         return read_scan(text, bad_points=config.bad_points), ""
-    source = open_source(text, config.bad_points)
-    dataset = source.scans()
-    # The files of a folder that is no known data set tell no sensor, as a file alone tells none; sensor.json does.
-    sensor = "" if source.data_set == "folder" and dataset.sensor == Folder.sensor else dataset.sensor
+    dataset = open_source(text, config.bad_points).scans()
     if not skips:
         scan, skipped = dataset.scan(0), ()
     else:
         (scan,), skipped = usable_scans(dataset, range(len(dataset)), at_most=1)
-    return replace(scan, notes=(*dataset.notes, *skipped, *scan.notes)), sensor
+    return replace(scan, notes=(*dataset.notes, *skipped, *scan.notes)), dataset.named_sensor

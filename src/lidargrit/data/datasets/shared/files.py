@@ -152,6 +152,12 @@ class FileDataset(ScanDataset):
                 return "folder"
         return cls.public_name()
 
+    @property
+    def named_sensor(self) -> str:
+        """Name or file of the sensor; "" in a folder of others' files that name none."""
+        is_of_others = self.origin_of(self.root) == "folder"
+        return "" if is_of_others and self.sensor == type(self).sensor else self.sensor
+
     @classmethod
     def matches(cls, root: Path) -> bool:
         """Return whether a folder holds a file where this tree has them, in the same format.
