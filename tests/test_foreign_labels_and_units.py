@@ -38,9 +38,11 @@ def test_labels_of_another_numbering_are_told_and_get_no_names(tmp_path, capsys)
     assert '"class 9"' in text
     assert '"outlier"' not in text
     assert '"bus"' not in text
-    assert main(["export", source, str(tmp_path / "out"), "--format", "kitti_odometry"]) == 0
-    output = capsys.readouterr()
-    assert TOLD in output.out + output.err
+    one_file = f"{source}/sequences/08/velodyne/000000.bin"
+    for words in (["export", source, str(tmp_path / "out"), "--format", "kitti_odometry"], ["inspect", one_file]):
+        assert main(words) == 0
+        output = capsys.readouterr()
+        assert TOLD in output.out + output.err
 
 
 def test_a_column_of_labels_of_another_numbering_is_told(tmp_path):

@@ -11,7 +11,6 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, OutputError, printable
 from lidargrit.data.datasets import ScanDataset, Window
-from lidargrit.data.formats import read_scan
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
@@ -217,11 +216,8 @@ def first_scan(text: str, config: DataConfig) -> tuple[Scan, str]:
     Returns:
         the scan, whose notes name those that were skipped; and the sensor of the data set, "" where none is known.
     """
-    skips = config.bad_scans == "skip"
-    if Path(text).is_file() and not skips:
-        return read_scan(text, bad_points=config.bad_points), ""
     dataset = open_source(text, config.bad_points).scans()
-    if not skips:
+    if config.bad_scans == "refuse":
         scan, skipped = dataset.scan(0), ()
     else:
         (scan,), skipped = usable_scans(dataset, range(len(dataset)), at_most=1)
