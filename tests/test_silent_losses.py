@@ -335,3 +335,29 @@ def test_a_sample_that_lacks_the_reflectance_of_those_beside_it_is_not_read_with
     assert images.batch([0, 1]).reflectance is not None
     with pytest.raises(DataError, match=r"sample 00000002 without reflectance; wanted what the first"):
         images.batch([1, 2])
+
+
+@pytest.mark.parametrize("words", [("export", "--format", "npz"), ("rescan", "--to", "vlp16", "--format", "npz")])
+def test_scans_that_have_changed_are_not_taken_for_those_that_were_written(kitti, tmp_path, capsys, words):
+    command = [words[0], str(kitti), str(tmp_path / "out"), *words[1:]]
+    assert main(command) == 0
+    assert main(command) == 0, "the same command goes on"
+    KittiBin.write(kitti / "000001.bin", simulate(7, K360.with_columns(128)))
+    capsys.readouterr()
+    assert main(command) == 2
+    told = capsys.readouterr().err
+    assert "where 000001.npz is of another scan" in told
+    assert "or of one that has changed" in told
+
+
+@pytest.mark.parametrize(
+    "words", [("inspect", "-o", "a.png"), ("view", "-o", "a.png"), ("inspect", "-o", "link.png", "--overwrite")]
+)
+def test_a_file_that_is_read_is_never_replaced(tmp_path, monkeypatch, capsys, words):
+    monkeypatch.chdir(tmp_path)
+    picture = tmp_path / "a.png"
+    picture.write_bytes(b"somebody's")
+    (tmp_path / "link.png").symlink_to(picture)
+    assert main([words[0], "a.png", *words[1:]]) == 2
+    assert "which is also read; wanted another name" in capsys.readouterr().err
+    assert picture.read_bytes() == b"somebody's"

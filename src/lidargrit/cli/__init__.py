@@ -7,12 +7,13 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
 from typing import Any
 
 from lidargrit.cli._parser import EXIT_CODES, SHELLS, HelpFormatter, Parser, script
 from lidargrit.cli._signals import raising_on_signals
 from lidargrit.core import discovery, reporting
-from lidargrit.core.errors import LidarGritError, Terminated, UsageError
+from lidargrit.core.errors import LidarGritError, OutputError, Terminated, UsageError
 from lidargrit.core.version import __version__
 
 _EXAMPLES = """\
@@ -61,6 +62,7 @@ def _run(words: list[str], is_program: bool = False) -> int:
         tells = is_program and options.verb and not options.waits and os.environ.get("RANK", "0") == "0"
         aloud = reporter.never_silent(f"lidargrit {options.verb}") if tells else nullcontext()
         with _refusing_unusable_paths(), reporting.to(reporter), aloud:
+            _refuse_to_replace_what_is_read(options)
             options.run(options)
             if sys.stdout is not None:  # closed by the caller
                 sys.stdout.flush()  # here, where a closed pipe is caught, and not when Python ends
@@ -149,6 +151,16 @@ def _parsed(parser: Parser, words: list[str]) -> argparse.Namespace:
     if too_many:
         (options.words if options.verb else parser).refuse(too_many[0])
     return options
+
+
+def _refuse_to_replace_what_is_read(options: argparse.Namespace) -> None:
+    """Raise OutputError if a file that the command would write is one that it reads, ``--overwrite`` or not."""
+    words = [*vars(options).values()]
+    words += [word for value in words if isinstance(value, Sequence) and not isinstance(value, str) for word in value]
+    read = [word for word in words if isinstance(word, str) and os.path.isfile(word)]  # a source is no Path: DATA:ROOT
+    for path in words:
+        if isinstance(path, Path) and path.is_file() and any(os.path.samefile(path, word) for word in read):
+            raise OutputError(f"{path}, which is also read", "another name", "choose one")
 
 
 @contextmanager

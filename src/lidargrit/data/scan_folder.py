@@ -156,7 +156,7 @@ class ScanFolder:
         ]:
             return f"whose {self._manifest.name} has another {other[0]!r}"
         changed = next((file for file, name in scans.items() if known.get(file, name) != name), None)
-        return f"where {changed} is another scan of {facts['source']}" if changed else ""
+        return f"where {changed} is of another scan of {facts['source']}, or of one that has changed" if changed else ""
 
 
 def write_sensor(out: Path, sensor: SensorModel) -> None:

@@ -15,6 +15,13 @@ from lidargrit.scans.types import RangeImage
 _COARSEST_MM = 1000
 
 
+def check_step(step_mm: int) -> None:
+    """Raise ConfigError if values are not to be rounded to such steps."""
+    if not (isinstance(step_mm, Integral) and 1 <= step_mm <= _COARSEST_MM):
+        wanted = f"a whole number of millimetres from 1 to {_COARSEST_MM}"
+        raise ConfigError(f"a step of {step_mm} mm", wanted, "take 10 for a centimetre")
+
+
 @dataclass(frozen=True)
 class RangeSteps:
     """The whole multiples of a step that a sensor's ranges are rounded to.
@@ -27,12 +34,7 @@ class RangeSteps:
     step_mm: int
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.step_mm, Integral) and 1 <= self.step_mm <= _COARSEST_MM):
-            raise ConfigError(
-                f"a step of {self.step_mm} mm",
-                f"a whole number of millimetres from 1 to {_COARSEST_MM}",
-                "take 10 for a centimetre",
-            )
+        check_step(self.step_mm)
 
     @property
     def first(self) -> int:
