@@ -19,7 +19,6 @@ from lidargrit.generation.facts import CAPABILITIES
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.scans.condition import Nothing, Observed
 from lidargrit.scans.example import Example
-from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 
@@ -274,8 +273,6 @@ def test_leaves_the_global_random_state_alone(name):
 def test_has_exactly_the_capabilities_that_it_declares(name):
     generator, _ = made(name)
     assert HOOKS.keys() == CAPABILITIES.keys()
-    assert (Observed in generator.takes) == ("complete" in generator.capabilities)
-    assert (Past in generator.takes) == (generator.past_scans > 0)
     for capability, hook in HOOKS.items():
         assert (getattr(type(generator), hook) is not getattr(Generator, hook)) == (
             capability in generator.capabilities

@@ -24,6 +24,7 @@ from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.precision import Precision, inference
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing, Observed
+from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -99,8 +100,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def takes(self) -> frozenset[type[Condition]]:
         """Types of conditions that :meth:`sample` takes; ``Nothing`` is among them if it has new scans to sample."""
-        new = frozenset({Nothing} if self.has_new_scans else ())
-        return new | {Observed} if "complete" in self.capabilities else new
+        told = {Nothing: self.has_new_scans, Past: self.past_scans > 0, Observed: "complete" in self.capabilities}
+        return frozenset(kind for kind, is_taken in told.items() if is_taken)
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
