@@ -15,7 +15,6 @@ from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.generator import load
 from lidargrit.generation.semantic_classes import NUM_CLASSES
 from lidargrit.nn.convolution import wrapped
-from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.segmenter.system import Segmenter, with_likeliest
@@ -33,11 +32,11 @@ def open_segmenter(word: str, device: str = "") -> Segmenter:
     folder, wanted = locate(word, "segment"), "a segmenter's run, or pretrained"
     if not folder.exists():
         raise ConfigError(f"--model {word}, which does not exist", wanted, "check the name")
-    generator = load(folder)
+    generator = load(folder, device=device)
     if not isinstance(generator, Segmenter):
         got = f"--model {word}, of a generator {generator.public_name()!r}, which labels no scans"
         raise ConfigError(got, wanted, "train one with: lidargrit train segmenter_compact RUN, and name its folder")
-    return generator.to(usable_device(device))
+    return generator
 
 
 def can_label(own: SensorModel, sensor: SensorModel) -> bool:
