@@ -17,6 +17,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.generation.facts import CAPABILITIES
 from lidargrit.generation.generator import Generator, load, load_class
+from lidargrit.inference.segment import label_images
 from lidargrit.scans.condition import Nothing, Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import load_sensor
@@ -77,7 +78,7 @@ def scans_of(generator, seeds, sampling):
     if Nothing in generator.takes:
         return generator.sample(seeds, sampling=sampling)
     if not generator.takes:  # it has no scans at all, and labels them
-        return generator.segment(IMAGES.batch([0] * len(seeds)))
+        return label_images(generator, IMAGES.batch([0] * len(seeds)))
     return generator.complete(known_of(generator, IMAGES.batch([0] * len(seeds))), seeds, sampling)
 
 
