@@ -20,7 +20,7 @@ import torch
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_images
 from lidargrit.evaluation.raydrop import RAYDROP_CURVES
-from lidargrit.evaluation.realism import distance, drop_independently, pair_of
+from lidargrit.evaluation.realism import batches, distance, drop_independently, pair_of
 from lidargrit.generation.generator import load
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.planes import planes_of
@@ -70,7 +70,7 @@ def main() -> None:
     }
     print("| drops by | " + " | ".join(RAYDROP_CURVES) + " |\n|---" + "|---" * len(RAYDROP_CURVES) + "|")
     for name, images in rows.items():
-        values = [distance(curve, [images], iter([others])).value for curve in RAYDROP_CURVES]
+        values = [distance(curve, batches(images), batches(others)).value for curve in RAYDROP_CURVES]
         print(f"| {name} | " + " | ".join(f"{value:.4f}" for value in values) + " |")
     if dropped.reflectance is not None:
         print("\nreflectance of the streets\n" + reflectance_table(dropped, measured, others))
@@ -109,8 +109,10 @@ def reflectance_table(found: RangeImage, true: RangeImage, others: RangeImage) -
         assert reflectance is not None
         error = float((reflectance[both] - _values(true, both)).double().abs().mean())
         image = RangeImage.masked(true.range_m, both, true.sensor, planes_of(reflectance=reflectance))
-        lines.append(f"| {name} | {error:.4f} | {distance('reflectance_histogram', [image], iter([true])).value:.4f} |")
-    lines.append(f"| other streets |  | {distance('reflectance_histogram', [others], iter([true])).value:.4f} |")
+        found = distance("reflectance_histogram", batches(image), batches(true))
+        lines.append(f"| {name} | {error:.4f} | {found.value:.4f} |")
+    found = distance("reflectance_histogram", batches(others), batches(true))
+    lines.append(f"| other streets |  | {found.value:.4f} |")
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""What the discriminator sees: corrected changes, and the three defects of DUSty's program by name."""
+"""What the discriminator sees: changes of DUSty's program, without its faults."""
 
 import torch
 
@@ -7,8 +7,8 @@ from lidargrit.systems.dusty.differentiable_augmentation import augment_differen
 IMAGES = torch.rand(500, 1, 32, 64, generator=torch.Generator().manual_seed(0)) * 2 - 1
 
 
-def augmented(*kinds, defects=(), seed=1, images=IMAGES):
-    return augment_differentiably(images, kinds, defects, torch.Generator().manual_seed(seed))
+def augmented(*kinds, images=IMAGES):
+    return augment_differentiably(images, kinds, torch.Generator().manual_seed(1))
 
 
 def test_brightness_goes_up_and_down():
@@ -25,20 +25,6 @@ def test_contrast_grows_and_shrinks_about_the_mean():
     assert torch.allclose(found.mean((1, 2, 3)), IMAGES.mean((1, 2, 3)), atol=1e-6)
     assert 0.5 <= float(factor.min()) < 0.52
     assert 1.48 < float(factor.max()) <= 1.5
-
-
-def test_squared_draws_only_brighten_and_steepen():
-    shift = (augmented("brightness", defects=("squared_draws",)) - IMAGES)[:, 0, 0, 0]
-    assert float(shift.min()) >= -1e-6
-    assert abs(float(shift.mean()) - 0.5 / 3) < 0.02  # of u² · 0.5 with u uniform on [-1, 1]
-    factor = augmented("contrast", defects=("squared_draws",)).std((1, 2, 3)) / IMAGES.std((1, 2, 3))
-    assert float(factor.min()) >= 1 - 1e-5
-
-
-def test_idle_saturation_changes_nothing_but_the_numbers_that_follow():
-    assert torch.equal(augmented("brightness", defects=("idle_saturation",)), augmented("brightness"))
-    both = ("brightness", "contrast")
-    assert not torch.equal(augmented(*both, defects=("idle_saturation",)), augmented(*both))
 
 
 def shifts_of(found, rows, columns):
@@ -60,15 +46,6 @@ def test_translation_turns_columns_and_lets_zeros_in_above_and_below():
     shifts = shifts_of(augmented("translation", images=IMAGES[:100]), 2, 4)  # a sixteenth of 32 and of 64
     assert {down for down, _ in shifts} == {-2, -1, 0, 1, 2}
     assert {along for _, along in shifts} == set(range(-4, 5))
-
-
-def test_a_short_circle_loses_the_last_column():
-    columns = torch.arange(64.0).expand(200, 1, 32, 64)
-    row = augmented("translation", images=columns, defects=("short_circle",))[:, 0, 16]
-    assert 63.0 not in row
-    assert all(len(set(one.tolist())) == 63 for one in row)
-    whole = augmented("translation", images=columns)[:, 0, 16]
-    assert all(len(set(one.tolist())) == 64 for one in whole)
 
 
 def test_cutout_blanks_a_window_that_may_reach_over_an_edge():

@@ -17,9 +17,9 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.generation.facts import CAPABILITIES
 from lidargrit.generation.generator import Generator, load, load_class
+from lidargrit.inference.segment import label_images
 from lidargrit.scans.condition import Nothing, Observed
 from lidargrit.scans.example import Example
-from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage
 
@@ -78,7 +78,7 @@ def scans_of(generator, seeds, sampling):
     if Nothing in generator.takes:
         return generator.sample(seeds, sampling=sampling)
     if not generator.takes:  # it has no scans at all, and labels them
-        return generator.segment(IMAGES.batch([0] * len(seeds)))
+        return label_images(generator, IMAGES.batch([0] * len(seeds)))
     return generator.complete(known_of(generator, IMAGES.batch([0] * len(seeds))), seeds, sampling)
 
 
@@ -274,8 +274,6 @@ def test_leaves_the_global_random_state_alone(name):
 def test_has_exactly_the_capabilities_that_it_declares(name):
     generator, _ = made(name)
     assert HOOKS.keys() == CAPABILITIES.keys()
-    assert (Observed in generator.takes) == ("complete" in generator.capabilities)
-    assert (Past in generator.takes) == (generator.past_scans > 0)
     for capability, hook in HOOKS.items():
         assert (getattr(type(generator), hook) is not getattr(Generator, hook)) == (
             capability in generator.capabilities

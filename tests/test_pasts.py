@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lidargrit.cli import main
-from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.errors import DataError
 from lidargrit.data.batches import Batches
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.pasts import Pasts
@@ -25,7 +25,6 @@ from lidargrit.scans.warp import warp
 from lidargrit.systems.forecaster.system import Forecaster, ForecasterObjective
 from lidargrit.training import train
 from lidargrit.training.compute import uniform_images
-from lidargrit.training.plan import check_stages
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(128, 4)
 CONFIG = DataConfig(columns=128, column_stride=4, workers=1)
@@ -112,12 +111,6 @@ def test_images_without_a_drive_tell_as_many_empty_scans_as_the_generator_takes(
     generator = preset.build_generator()
     told = conditions.load("past", generator.past_scans).of(uniform_images(generator.sensor, 2))
     assert told.range_m.shape[:2] == (2, 3)
-
-
-def test_a_generator_that_takes_a_past_says_of_how_many_scans(monkeypatch):
-    monkeypatch.setattr(Forecaster, "past_scans", 0)
-    with pytest.raises(ConfigError, match="condition=past for 'forecaster', whose past_scans is 0"):
-        check_stages(load_preset("forecaster_compact"))
 
 
 def moving(times_s: list[float | None], places_m: list[float | None]) -> list[TimedScan]:

@@ -20,7 +20,7 @@ from lidargrit.data.run_folder import locate
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.presets import load_preset
-from lidargrit.inference.segment import open_segmenter
+from lidargrit.inference.segment import label_images, open_segmenter
 from lidargrit.inference.segment.command import LabelScores
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.types import RangeImage
@@ -97,7 +97,7 @@ def test_its_segmenter_labels_streets_that_it_did_not_learn_from():
     scores = LabelScores()
     for seed in (2_000_000, 2_000_001):
         image = RangeImage.stack([project(simulate(seed=seed), segmenter.sensor)])
-        scores.add(segmenter.segment(image).label.flatten(), image.label.flatten())
+        scores.add(label_images(segmenter, image).label.flatten(), image.label.flatten())
     assert scores.mean() > 0.4
     assert scores.intersection_over_union()["road"] > 0.8
     with pytest.raises(ConfigError, match=r"^got --model pretrained_wide, of a generator 'lidargrit', which labels no"):

@@ -4,7 +4,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -87,7 +86,7 @@ def test_it_learns_the_classes_of_streets():
     assert terms[-1]["mean_iou"] > 2 * terms[0]["mean_iou"]
     found = made()
     found.load_stage("segmenter", objective)
-    label = found.segment(images).label
+    label = label_images(found, images).label
     assert label is not None
     learned = torch.tensor([[CLASSES[int(n)].learned for n in row] for row in images.label.flatten(1)]).view_as(label)
     known = learned > 0
@@ -163,11 +162,10 @@ def test_images_of_more_columns_are_labelled_by_votes_of_several(run):
     assert moved > 1000
     assert not label[~images.return_mask].any()
     narrow = RangeImage.stack([project(scan_of(5), SENSOR)])
-    assert torch.equal(label_images(segmenter, narrow).label, segmenter.segment(narrow).label)
+    assert torch.equal(class_probabilities(segmenter, narrow), segmenter.probabilities(narrow))
     for wrong in (narrow[0], narrow[:0]):
-        for labels in (segmenter.segment, partial(label_images, segmenter)):
-            with pytest.raises(ConfigError, match=r"^got range images of shape .* at least one; make a batch"):
-                labels(wrong)
+        with pytest.raises(ConfigError, match=r"^got range images of shape .* at least one; make a batch"):
+            label_images(segmenter, wrong)
 
 
 def test_bends_are_those_of_a_loop_and_nearly_none_on_a_wall():

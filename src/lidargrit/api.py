@@ -54,6 +54,7 @@ __all__ = [
 
 Points: TypeAlias = Scan | np.ndarray | Tensor
 """A scan, or coordinates of its points in metres as an array (n, 3), or (n, 4) with intensity."""
+_packaged_model, _packaged_segmenter = lru_cache(open_model), lru_cache(open_segmenter)  # each is read once
 
 
 def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
@@ -165,14 +166,9 @@ def segment(points: Points, model: str | Segmenter = "pretrained") -> Scan:
         is_car = lidargrit.segment(points).label == 10
     """
     scan = _as_scan(points)
-    segmenter = _packaged_segmenter() if model == PACKAGED[0].name else model
+    segmenter = _packaged_segmenter(PACKAGED[0].name) if model == PACKAGED[0].name else model
     labels = PointLabels(segmenter if isinstance(segmenter, Segmenter) else open_segmenter(segmenter))
     return replace(scan, label=labels.of(scan)[0])
-
-
-@lru_cache
-def _packaged_segmenter() -> Segmenter:
-    return open_segmenter(PACKAGED[0].name)
 
 
 def evaluate(
@@ -223,12 +219,7 @@ def _opened(model: str | Model, kind: ConditionKind, sensor: SensorModel | None 
     if isinstance(model, Model):
         return model
     packaged = model in {folder.name for folder in PACKAGED}
-    return _packaged(model, kind) if packaged and sensor is None else open_model(model, kind, sensor)
-
-
-@lru_cache
-def _packaged(name: str, kind: ConditionKind) -> Model:
-    return open_model(name, kind)
+    return _packaged_model(model, kind) if packaged and sensor is None else open_model(model, kind, sensor)
 
 
 def torch_dataset(source: str, sensor: SensorModel | str | None = None) -> TorchDataset:

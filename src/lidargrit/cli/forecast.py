@@ -32,10 +32,9 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
     from lidargrit.inference.drives import continued, write_drives
-    from lidargrit.nn.devices import usable_device
 
     run_folder = locate(options.model, "drive")
-    generator = load(run_folder).to(usable_device(options.device))
+    generator = load(run_folder, device=options.device)
     way = continued(options.drive, generator, options.count, options.after, options.constant_speed)
     sampling = generator.parse_sampling(sampling_words(options.set))
     facts = {name: vars(options)[name] for name in ("drive", "after", "constant_speed")}

@@ -39,7 +39,6 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.generation.generator import load
     from lidargrit.inference.drives import opening_of, path_of, write_drives
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
-    from lidargrit.nn.devices import usable_device
 
     seeds, job = seeds_in_a_row(options.seed, options.count), "drive" if options.frames else "sample"
     address, words, sensor = ray_address(options), sampling_words(options.set), sensor_of(options)
@@ -48,8 +47,8 @@ def run(options: argparse.Namespace) -> None:
     else:
         rank, world_size = rank_and_world_size(options.rank, options.world_size)
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-        device, run_folder = usable_device(options.device or own), locate(options.run_folder, job)
-        generator, seeds = load(run_folder).to(device), seeds[rank::world_size]
+        run_folder = locate(options.run_folder, job)
+        generator, seeds = load(run_folder, device=options.device or own), seeds[rank::world_size]
         generator = generator.for_sensor(sensor or generator.sensor)
         sampling = generator.parse_sampling(words)
         if options.frames:

@@ -137,13 +137,11 @@ class RangeImages:
         """
         batches: list[list[int]] = []
         for index in indices:
-            if not batches or len(batches[-1]) == at_most or not self._same_sensor(batches[-1][0], index):
+            last = batches[-1] if batches else []
+            if not last or len(last) == at_most or self.sensor_of(last[0]) is not self.sensor_of(index):
                 batches.append([])
             batches[-1].append(index)
         return batches
-
-    def _same_sensor(self, one: int, other: int) -> bool:
-        return self.sensor_of(one) is self.sensor_of(other)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0

@@ -16,7 +16,6 @@ from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.pasts import Pasts
-from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import open_source
 from lidargrit.evaluation.drive_errors import (
     ErrorsOfForecast,
@@ -31,7 +30,6 @@ from lidargrit.evaluation.odometry import INSTALL, SETTLING_SCANS, kiss_icp_is_t
 from lidargrit.evaluation.protocols import load_protocol, public_name
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelSampling
-from lidargrit.nn.devices import usable_device
 from lidargrit.scans.motion import transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import points_of_pixels
@@ -152,11 +150,11 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
 
 
 def _forecaster(model: str, device: str) -> Generator:
-    generator = load(locate(model, "drive"))
+    generator = load(model, "drive", device)
     if not generator.past_scans:
         got = f"the model {model}, which takes no past"
         raise ConfigError(got, "one that forecasts", "leave --model out, or train one with data.condition=past")
-    return generator.to(usable_device(device))
+    return generator
 
 
 def _errors_at(

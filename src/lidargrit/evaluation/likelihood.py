@@ -22,7 +22,6 @@ from lidargrit.evaluation.intervals import Estimate
 from lidargrit.evaluation.pairs import EvalSet
 from lidargrit.evaluation.reconstruction import score_reconstruction
 from lidargrit.generation.generator import Generator, load
-from lidargrit.nn.devices import usable_device
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING
 from lidargrit.scans.projection.image import told_share
@@ -184,7 +183,7 @@ def measure_source(
     """
     run = RunSource(model, locate(model))
     config = run.as_projected(config)
-    generator = load(locate(model)).to(usable_device(device))
+    generator = load(model, device=device)
     generator = generator if sensor is None else generator.for_sensor(sensor)
     has_tokens = "tokens" in generator.capabilities
     source = open_source(text, config.bad_points)

@@ -15,7 +15,6 @@ from lidargrit.evaluation.protocols import public_name
 from lidargrit.evaluation.realism import CurveScore, SimulatedScans, StreetScans, compare, score_curves, tables
 from lidargrit.evaluation.street_figures import figures_table
 from lidargrit.generation.generator import Generator, load
-from lidargrit.nn.devices import usable_device
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import ranges_from_others
 from lidargrit.scans.types import RangeImage
@@ -87,7 +86,7 @@ def raydrop_model(word: str, device: str = "") -> Generator:
     Args:
         word: folder of a finished run, or ``pretrained``.
     """
-    generator = load(word).to(usable_device(device))
+    generator = load(word, device=device)
     _check(generator)
     return generator
 

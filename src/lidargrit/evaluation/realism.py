@@ -131,8 +131,8 @@ def score_curves(
     independent = drop_independently(clean, returned / pixels)
     return [
         CurveScore(
-            distance(name, [own], batches(true)),
-            distance(name, [independent], batches(true)),
+            distance(name, batches(own), batches(true)),
+            distance(name, batches(independent), batches(true)),
             distance(name, batches(true, 0, half), batches(true, half)),
             distance(name, batches(beside), batches(true)) if beside else None,
             scans,
@@ -266,15 +266,12 @@ def batches(images: RangeImages | RangeImage, first: int = 0, last: int | None =
         yield images[start:end] if isinstance(images, RangeImage) else images.batch(range(start, end))
 
 
-def distance(
-    name: str, generated: Sequence[RangeImage] | Iterator[RangeImage], real: Iterator[RangeImage]
-) -> MetricResult:
-    """Return the distance of one curve of generated scans from that of real ones."""
+def distance(name: str, generated: Iterator[RangeImage], real: Iterator[RangeImage]) -> MetricResult:
+    """Return the distance of one curve of generated scans from that of real ones, both given in batches."""
     metric = load_metric(name)()
     for images, is_real in ((generated, False), (real, True)):
         for batch in images:
-            for start in range(0, len(batch), _BATCH):
-                metric.update(batch[start : start + _BATCH], real=is_real)
+            metric.update(batch, real=is_real)
     return metric.compute()
 
 

@@ -21,9 +21,11 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, read_saved
 from lidargrit.generation.tokenizers import Tokenizer
+from lidargrit.nn.devices import usable_device
 from lidargrit.nn.precision import Precision, inference
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing, Observed
+from lidargrit.scans.past import Past
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 
@@ -99,8 +101,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def takes(self) -> frozenset[type[Condition]]:
         """Types of conditions that :meth:`sample` takes; ``Nothing`` is among them if it has new scans to sample."""
-        new = frozenset({Nothing} if self.has_new_scans else ())
-        return new | {Observed} if "complete" in self.capabilities else new
+        told = {Nothing: self.has_new_scans, Past: self.past_scans > 0, Observed: "complete" in self.capabilities}
+        return frozenset(kind for kind, is_taken in told.items() if is_taken)
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
@@ -368,17 +370,20 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return generator
 
 
-def load(name: str | Path, job: Job = "sample") -> Generator:
+def load(name: str | Path, job: Job = "sample", device: str = "cpu") -> Generator:
     """Read a trained generator from a run's folder; ``pretrained`` and ``pretrained_wide`` come with the package.
 
     Args:
         name: folder of a run, or of a bundle of runs.
         job: job of the run that is read from a bundle.
+        device: name of the device that it computes on; with "", a GPU if there is one, and else the CPU.
 
     Raises:
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
+        ConfigError: no such device.
     """
-    generator, bundle = read_saved(locate(name, job), load_class), named_folder(name)
+    there, bundle = usable_device(device), named_folder(name)
+    generator = read_saved(locate(name, job), load_class).to(there)
     if job == "sample" and is_bundle(bundle):
         generator.bundle = Bundle({each: partial(load, bundle, each) for each in ("complete", "raydrop")})
     return generator

@@ -22,7 +22,7 @@ def encode(images: RangeImage, with_reflectance: bool) -> Float[Tensor, "B C H W
     level = _log_range(images.sensor).encode(images.range_m, images.return_mask)
     if not with_reflectance:
         return level[:, None]
-    reflectance = reflectance_of_returns(images, "model.reflectance")
+    reflectance = reflectance_of_returns(images)
     return torch.stack((level, 2 * reflectance * images.return_mask - 1), dim=1)
 
 

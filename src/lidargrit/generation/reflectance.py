@@ -27,11 +27,11 @@ def required_reflectance(reflectance: Float[Tensor, "*B H W"] | None, setting: s
     return reflectance
 
 
-def reflectance_of_returns(images: RangeImage, setting: str) -> Float[Tensor, "*B H W"]:
+def reflectance_of_returns(images: RangeImage) -> Float[Tensor, "*B H W"]:
     """Return the reflectance of images as :func:`required_reflectance` does, and 0 where none of them has a return."""
     if images.reflectance is None and not bool(images.return_mask.any()):
         return torch.zeros_like(images.range_m)
-    return required_reflectance(images.reflectance, setting)
+    return required_reflectance(images.reflectance, "model.reflectance")
 
 
 def reflectance_error(

@@ -28,7 +28,6 @@ from lidargrit.data.run_folder import TRAINED_ON_FILE, recorded_projection, trai
 from lidargrit.data.scan_folder import begun_by
 from lidargrit.data.sources.samples import MANIFEST, is_sample_folder
 from lidargrit.generation.generator import Generator, SamplingT, load
-from lidargrit.nn.devices import usable_device
 from lidargrit.scans.types import RangeImage
 
 _SHARE_ON_RAY = 32  # seeds: two batches, seconds of work
@@ -109,7 +108,7 @@ def _write_some(run_folder: Path, folder: Path, words: Sequence[str], device: st
 
 @lru_cache(maxsize=1)  # for all shares of a worker
 def _generator_of(run_folder: Path, device: str) -> Generator[Any, Any]:
-    return load(run_folder).to(usable_device(device))
+    return load(run_folder, device=device)
 
 
 def sampling_identity(generator: Generator[Any, Any], run_folder: Path, sampling: object) -> dict[str, Any]:

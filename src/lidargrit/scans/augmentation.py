@@ -63,8 +63,7 @@ def augment(
         elif kind == "paste":
             example = replace(example, images=_paste(example.images, another, rng))
         else:
-            change = _geometric if kind == "geometric" else _geometric_reference
-            example = replace(example, images=change(example.images, rng))
+            example = replace(example, images=_distort(example.images, rng, kind == "geometric_reference"))
     return example
 
 
@@ -105,21 +104,13 @@ def _paste(images: RangeImage, another: Callable[[], RangeImage] | None, rng: to
     return _pick(chosen & nearer, other, images)
 
 
-def _geometric(images: RangeImage, rng: torch.Generator) -> RangeImage:
-    return _distort(images, rng, extra_rotation_rad=0.0, fill_m=0.0)
-
-
-def _geometric_reference(images: RangeImage, rng: torch.Generator) -> RangeImage:
-    return _distort(images, rng, extra_rotation_rad=_EXTRA_ROTATION_RAD, fill_m=images.sensor.range_max_m)
-
-
-def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float, fill_m: float) -> RangeImage:
+def _distort(images: RangeImage, rng: torch.Generator, as_program: bool) -> RangeImage:
     batch, height, width = images.range_m.shape
 
     def uniform(limit: float) -> Tensor:
         return (torch.rand(batch, generator=rng) * 2 - 1) * limit
 
-    angle = uniform(_MAX_ROTATION_RAD) + uniform(extra_rotation_rad)
+    angle = uniform(_MAX_ROTATION_RAD) + uniform(_EXTRA_ROTATION_RAD if as_program else 0.0)
     scale = 1 + uniform(_MAX_SCALE_CHANGE)
     flip_columns, flip_rows = ((torch.rand(batch, generator=rng) < 0.5) * -2.0 + 1 for _ in range(2))
     cos, sin = angle.cos() / scale, angle.sin() / scale
@@ -136,16 +127,11 @@ def _distort(images: RangeImage, rng: torch.Generator, extra_rotation_rad: float
     def warp(pixels: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
         return F.grid_sample(pixels[:, None], grid, mode="nearest", padding_mode="zeros", align_corners=False)[:, 0]
 
-    if fill_m:
+    warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
+    if as_program:
         outside = warp(torch.ones_like(images.range_m)) == 0
-        warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
-        warped = replace(
-            warped,
-            range_m=torch.where(outside, fill_m, warped.range_m),
-            return_mask=warped.return_mask | outside,
-        )
-    else:
-        warped = images.mapped(lambda pixels: warp(pixels.float()).to(pixels.dtype))
+        range_m = torch.where(outside, images.sensor.range_max_m, warped.range_m)
+        warped = replace(warped, range_m=range_m, return_mask=warped.return_mask | outside)
     return _pick(_coin(images, rng), warped, images)
 
 

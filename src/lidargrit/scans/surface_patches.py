@@ -89,7 +89,7 @@ def plane_residuals(image: RangeImage) -> Float64[np.ndarray, "H"]:
     return np.array([np.median(of) if len(of) >= _FEWEST else np.nan for of in of_rows])
 
 
-def row_offsets(images: Sequence[RangeImage], rounds: int = 5) -> Float64[np.ndarray, "H"]:
+def row_offsets(images: Sequence[RangeImage]) -> Float64[np.ndarray, "H"]:
     """Return the offset that each row adds to all ranges, in metres: the median over images, 0 where none is known.
 
     Planes are fitted again to ranges without the offsets found so far, since the first residuals hold what is left
@@ -97,10 +97,9 @@ def row_offsets(images: Sequence[RangeImage], rounds: int = 5) -> Float64[np.nda
 
     Args:
         images: single range images of one sensor.
-        rounds: number of such fits; with five the offsets are found to a tenth of their size.
     """
     found_m = np.zeros(images[0].sensor.height)
-    for _ in range(rounds):
+    for _ in range(5):  # they are then found to a tenth of their size
         left_m = np.array([plane_residuals(_without(image, found_m)) for image in images])
         known = ~np.isnan(left_m).all(axis=0)
         found_m[known] += np.nanmedian(left_m[:, known], axis=0)

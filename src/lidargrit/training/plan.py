@@ -16,7 +16,6 @@ from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
 from lidargrit.nn.precision import Precision
 from lidargrit.scans.condition import Nothing
-from lidargrit.scans.past import Past
 from lidargrit.training.compute import computing_time, training_flops
 from lidargrit.training.optimiser import memory_of_weights
 from lidargrit.training.stage import follow_settings
@@ -157,9 +156,6 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     if told.kind is not Nothing and told.kind not in generator.takes:
         got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, which cannot be told it"
         raise ConfigError(got, "a generator that takes it", "leave it out")
-    if told.kind is Past and not told.past_scans:
-        got = f"data.condition={preset.data.condition} for {generator.public_name()!r}, whose past_scans is 0"
-        raise ConfigError(got, "a generator that says how many scans it is told", "write its property past_scans")
     checked = CheckedStages(objectives, taken, preset.frozen, told)
     for name, objective in checked.trained.items():
         follow_settings(objective, preset.settings_of(name), processes)

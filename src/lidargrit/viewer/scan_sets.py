@@ -13,7 +13,6 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, ScanError, no_usable_scan
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
-from lidargrit.data.run_folder import locate
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.data.windows import TimedScan
 from lidargrit.generation.generator import Generator, load
@@ -85,7 +84,7 @@ def load_scan_sets(
     opened = [open_source(source, config.bad_points) for source in sources]
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)
     seeds = seeds_in_a_row(seed, count) if runs else range(0)
-    generators = {source.text: load(locate(source.text)).to(chosen) for source in runs}
+    generators = {source.text: load(source.text).to(chosen) for source in runs}
     named = settings.load_sensor()
     scans_alone = sensor is None and all(isinstance(source, DatasetSource) for source in opened)
     fine = all_columns and scans_alone and not config.columns

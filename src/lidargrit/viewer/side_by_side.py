@@ -8,7 +8,6 @@ from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.generation.generator import load
-from lidargrit.nn.devices import usable_device
 from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
 from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
@@ -35,7 +34,7 @@ def view(
     if not 1 <= count <= at_most:
         other = "" if is_page else f", or write an .html, which takes {PAGE_SCANS_AT_MOST}"
         raise ConfigError(f"{count} scans of each set", f"1 to {at_most}", f"correct the number{other}")
-    model = load(anomaly_by).to(usable_device(device)) if anomaly_by else None
+    model = load(anomaly_by, device=device) if anomaly_by else None
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:

@@ -138,8 +138,5 @@ class CodebookTokenizer(Tokenizer[Config]):
 
 def make_tokenizer(config: TokenizerConfig, sensor: SensorModel) -> Tokenizer[Any]:
     """Return a tokenizer of the kind that the configuration is of, with fresh weights."""
-    return _load_class(config.name())(config, sensor)
-
-
-def _load_class(name: str) -> type[Tokenizer[Any]]:
-    return discovery.load_class("tokenizers", name, Tokenizer)
+    kind: type[Tokenizer[Any]] = discovery.load_class("tokenizers", config.name(), Tokenizer)
+    return kind(config, sensor)

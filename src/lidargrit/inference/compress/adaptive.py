@@ -28,6 +28,7 @@ _MEMORY = 300.0  # pixels of a class that its weights and widths are means of
 _LEAST_WEIGHT, _LEAST_WIDTH_M = 1e-4, 0.002
 _ANYWHERE = 1e-4  # probability of a range that has nothing to do with its neighbours
 _COUNTED = 1 << 14
+_ADDED = 5  # counts of one outcome; the more, the sooner is a new context believed
 _START_M = 20.0
 _NEAREST_M = 0.1  # as predictions have it, which divide by distances
 _WIDTHS = 1.386  # mean absolute deviation of a logistic distribution of scale 1: 2 ln 2
@@ -51,11 +52,10 @@ class Counts:
 
     Args:
         contexts: number of contexts.
-        weight: counts that one outcome adds; the more, the sooner is a new context believed.
     """
 
-    def __init__(self, contexts: int, weight: int = 5) -> None:
-        self._counts, self._weight = np.full((contexts, 2), 2, dtype=np.int64), weight
+    def __init__(self, contexts: int) -> None:
+        self._counts = np.full((contexts, 2), 2, dtype=np.int64)
 
     def code(
         self, coder: Coder, context: Int64[np.ndarray, " m"], outcome: Bool[np.ndarray, " m"] | None
@@ -63,7 +63,7 @@ class Counts:
         """Code or decode decisions, all by what was known before them; ``outcome`` is None to decode."""
         counts = self._counts[context]
         found = coder.decisions(counts[:, 1] * ONE // (counts[:, 0] + counts[:, 1]), outcome)
-        np.add.at(self._counts, (context, found.astype(np.int64)), self._weight)
+        np.add.at(self._counts, (context, found.astype(np.int64)), _ADDED)
         many = context[self._counts[context].sum(1) > _COUNTED]
         if len(many):  # what is long ago counts less
             self._counts[many] = (self._counts[many] + 1) // 2

@@ -13,12 +13,11 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import locate
 from lidargrit.generation.batches import check_images, one_by_one
 from lidargrit.generation.generator import load
-from lidargrit.generation.semantic_classes import NUM_CLASSES
+from lidargrit.generation.semantic_classes import NUM_CLASSES, labels_of
 from lidargrit.nn.convolution import wrapped
-from lidargrit.nn.devices import usable_device
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-from lidargrit.systems.segmenter.system import Segmenter, with_likeliest
+from lidargrit.systems.segmenter.system import Segmenter
 
 _SAME_ROW_RAD = math.radians(0.01)
 _SAME_SURFACE_M, _SAME_SURFACE_PER_RANGE = 0.2, 0.02  # returns of a surface differ in range by at most this
@@ -33,11 +32,11 @@ def open_segmenter(word: str, device: str = "") -> Segmenter:
     folder, wanted = locate(word, "segment"), "a segmenter's run, or pretrained"
     if not folder.exists():
         raise ConfigError(f"--model {word}, which does not exist", wanted, "check the name")
-    generator = load(folder)
+    generator = load(folder, device=device)
     if not isinstance(generator, Segmenter):
         got = f"--model {word}, of a generator {generator.public_name()!r}, which labels no scans"
         raise ConfigError(got, wanted, "train one with: lidargrit train segmenter_compact RUN, and name its folder")
-    return generator.to(usable_device(device))
+    return generator
 
 
 def can_label(own: SensorModel, sensor: SensorModel) -> bool:
@@ -56,8 +55,9 @@ def label_images(segmenter: Segmenter, images: RangeImage) -> RangeImage:
         images: batch of range images (B, H, W) for which :func:`can_label` holds.
     """
     check_images(images, images.sensor)
-    labelled = [with_likeliest(image.to("cpu"), class_probabilities(segmenter, image)) for image in one_by_one(images)]
-    return RangeImage.cat(labelled)
+    label = torch.cat([labels_of(class_probabilities(segmenter, image).argmax(1) + 1) for image in one_by_one(images)])
+    images = images.to("cpu")
+    return images.with_planes(label=torch.where(images.return_mask, label, 0))
 
 
 def class_probabilities(segmenter: Segmenter, image: RangeImage) -> Float[Tensor, "1 19 H W"]:

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 DifferentiableAugmentation = Literal["brightness", "contrast", "translation", "cutout"]
-AugmentationDefect = Literal["squared_draws", "idle_saturation", "short_circle"]
 
 _STRENGTH = 0.5  # of brightness and contrast
 _SHIFT = 1 / 16  # of rows and of columns, either way
@@ -19,7 +18,6 @@ _CUT = 0.5  # of rows and of columns
 def augment_differentiably(
     images: Float[Tensor, "B 1 H W"],
     kinds: Sequence[DifferentiableAugmentation],
-    defects: Sequence[AugmentationDefect],
     rng: torch.Generator,
 ) -> Float[Tensor, "B 1 H W"]:
     """Change every image of a batch at random, so that gradients flow through to it.
@@ -29,38 +27,31 @@ def augment_differentiably(
         kinds: ``brightness`` adds up to half; ``contrast`` scales the distance from the image's mean by 1/2 to 3/2;
             ``translation`` turns columns around the circle and shifts rows, with zeros coming in; ``cutout`` sets a
             window of half the rows and half the columns to zero, less where it reaches over an edge.
-        defects: faults of DUSty v1's program to repeat. ``squared_draws``: numbers sampled from [-1, 1] for
-            brightness and contrast are squared, so that images only become brighter and steeper. ``idle_saturation``:
-            after brightness, colours are saturated, which takes a random number and changes nothing in an image of one
-            channel. ``short_circle``: the circle is a column too short, so that the last column is never seen and
-            another is seen twice.
         rng: source of all randomness, on the images' device.
 
     Source:
         Zhao et al., Differentiable Augmentation for Data-Efficient GAN Training, 2020; kazuto1011/dusty-gan@0374a5e,
-        utils/diff_augment.py, for the circle and the defects.
+        utils/diff_augment.py, for the circle. That program squares the numbers of brightness and contrast, so that
+        images only become brighter and steeper, and its circle is a column too short; neither is repeated here.
     """
 
     def random_change() -> Float[Tensor, "B 1 1 1"]:
-        uniform = torch.rand(len(images), 1, 1, 1, generator=rng, device=images.device) * 2 - 1
-        return uniform**2 if "squared_draws" in defects else uniform
+        return torch.rand(len(images), 1, 1, 1, generator=rng, device=images.device) * 2 - 1
 
     for kind in kinds:
         if kind == "brightness":
             images = images + _STRENGTH * random_change()
-            if "idle_saturation" in defects:
-                random_change()
         elif kind == "contrast":
             mean = images.mean(dim=(1, 2, 3), keepdim=True)
             images = mean + (images - mean) * (1 + _STRENGTH * random_change())
         elif kind == "translation":
-            images = _translated(images, images.shape[-1] - ("short_circle" in defects), rng)
+            images = _translated(images, rng)
         else:
             images = _cut_out(images, rng)
     return images
 
 
-def _translated(images: Tensor, circle: int, rng: torch.Generator) -> Tensor:
+def _translated(images: Tensor, rng: torch.Generator) -> Tensor:
     batch, _, height, width = images.shape
     rows, columns = (
         torch.arange(size, device=images.device) + _whole(-round(_SHIFT * size), round(_SHIFT * size), batch, rng)
@@ -68,7 +59,7 @@ def _translated(images: Tensor, circle: int, rng: torch.Generator) -> Tensor:
     )
     rows = rows.clamp(-1, height) + 1  # of an image with a row of zeros above and below
     shifted = F.pad(images, (0, 0, 1, 1)).gather(2, rows[:, None, :, None].expand(-1, 1, -1, width))
-    return shifted.gather(3, (columns % circle)[:, None, None, :].expand(-1, 1, height, -1))
+    return shifted.gather(3, (columns % width)[:, None, None, :].expand(-1, 1, height, -1))
 
 
 def _cut_out(images: Tensor, rng: torch.Generator) -> Tensor:

@@ -311,7 +311,7 @@ class AdversarialObjective(Objective):
         return returned * encoded + (1 - returned) * _NO_RETURN, returned.detach().mean()
 
     def _augment(self, images: Tensor, rng: torch.Generator) -> Tensor:
-        return augment_differentiably(images, self.config.augmentations, (), rng)
+        return augment_differentiably(images, self.config.augmentations, rng)
 
 
 def _widths(config: DustyConfig) -> Widths:

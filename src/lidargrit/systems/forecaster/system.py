@@ -82,11 +82,6 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
         return ForecasterConfig(replace(sizes, decoded_components=True), past_scans=2, past_width=8, past_blocks=1)
 
     @property
-    def takes(self) -> frozenset[type[Condition]]:
-        """Return that scans are sampled given their past, or nothing."""
-        return frozenset({Nothing, Past})
-
-    @property
     def past_scans(self) -> int:
         """Number of past scans, as the configuration says."""
         return self.config.past_scans

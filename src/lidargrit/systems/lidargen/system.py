@@ -239,7 +239,7 @@ def encode(images: RangeImage, config: LidarGenConfig) -> Float[Tensor, "B C H W
     level = (torch.log2(images.range_m + _NOTHING_M + 1) / _LOG2_OF_1).clamp(0, 1)
     if not config.reflectance:
         return level[:, None]
-    reflectance = reflectance_of_returns(images, "model.reflectance")
+    reflectance = reflectance_of_returns(images)
     return torch.stack((level, reflectance.clamp(0, 1) * images.return_mask), dim=1)
 
 

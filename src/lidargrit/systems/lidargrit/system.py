@@ -112,7 +112,7 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return NextToken(self.tokenizer, self.transformer)
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: TokenSampling) -> RangeImage:
-        return self._by_tokens(None, rngs_of(seeds), seeds.num_asked_for, sampling)
+        return self._by_tokens(None, seeds, sampling)
 
     @property
     def conditions(self) -> frozenset[ConditionKind]:
@@ -120,27 +120,23 @@ class LidarGrit(TokenGenerator[LidarGritConfig, TokenSampling]):
         return frozenset({"pixels", "surfaces"})
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
-        return self._by_tokens(condition, rngs_of(seeds), seeds.num_asked_for, sampling)
+        return self._by_tokens(condition, seeds, sampling)
 
-    def _by_tokens(
-        self, condition: Observed | None, rngs: list[torch.Generator], count: int, sampling: TokenSampling
-    ) -> RangeImage:
+    def _by_tokens(self, condition: Observed | None, seeds: BatchSeeds, sampling: TokenSampling) -> RangeImage:
         """Generate the tokens without any observed pixel, and with a pixel decoder the pixels around observed ones.
 
         Tokens come row by row, or in windows column by column, and pixels in phases. Each is conditioned on the
         observed ones before it, not on later ones.
-
-        Args:
-            count: number of scans to return.
         """
         self.check_choice(sampling.mask, sampling.pixels())
+        rngs = rngs_of(seeds)
         uniform = torch.stack([torch.rand(math.prod(self.tokenizer.grid_size), generator=rng) for rng in rngs])
         tokens = None if condition is None else self.observed_tokens(condition)
         with self._one_at_a_time:  # threads would write into one cache
             decoder, tokenizer = self._prepare(len(rngs), sampling)
             if tokens is None or bool((tokens < 0).any()):
                 tokens = decoder.generate(uniform.to(self.device), tokens)
-        return self.decode(tokens, count, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
+        return self.decode(tokens, seeds.num_asked_for, rngs, sampling.mask, sampling.pixels(), tokenizer, condition)
 
     def token_bits(self, grid: TokenGrid) -> Float[Tensor, "B h w"]:
         """Return the bits of each token given those before it."""

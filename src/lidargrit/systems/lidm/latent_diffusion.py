@@ -50,7 +50,6 @@ def ddim_steps(steps: int) -> Int[Tensor, "t"]:
 def ddim(
     denoiser: LatentDenoiser,
     noise: Callable[[], Float[Tensor, "B D h w"]],
-    shares: Float[Tensor, "1000"],
     steps: int,
     eta: float,
 ) -> Float[Tensor, "B D h w"]:
@@ -60,13 +59,12 @@ def ddim(
     noise of a standard deviation of 0.039, which the codebook absorbs.
 
     Args:
-        shares: ᾱ of every time step; see :func:`signal_shares`.
         eta: share of a step's noise that is fresh; 0 for the noise of the beginning only.
 
     Source:
         Song et al., DDIM, 2021, eq. 12 and 16.
     """
-    latents, chosen = noise(), ddim_steps(steps)
+    latents, shares, chosen = noise(), signal_shares(), ddim_steps(steps)
     nows = shares[chosen].tolist()
     thens = [float(shares[0]), *nows[:-1]]
     for step, now, then in zip(reversed(chosen.tolist()), reversed(nows), reversed(thens), strict=True):

@@ -175,7 +175,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         axes = copy.deepcopy(self.axes)
         if axes is not None:
             axes.fit(self.tokenizer.quantize.embedding.weight, self.tokenizer.quantize.share())
-        return LatentDenoising(self.tokenizer, self.denoiser, scale, self._shares(), axes)
+        return LatentDenoising(self.tokenizer, self.denoiser, scale, axes)
 
     def load_stage(self, stage: str, objective: Objective) -> None:
         """Take over a stage's trained weights, and the scale or the axes of the latents that it saw."""
@@ -195,7 +195,7 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
 
     def _sample(self, seeds: Sequence[int], condition: Condition, sampling: LidmSampling) -> RangeImage:
         noise = SeededNoise(seeds, self.latent_shape, self.device)
-        latents = latent_diffusion.ddim(self.denoiser, noise, self._shares(), sampling.steps, sampling.eta)
+        latents = latent_diffusion.ddim(self.denoiser, noise, sampling.steps, sampling.eta)
         latents = latents * self.latent_scale if self.axes is None else self.axes.latents(latents)
         decoding = self.tokenizer.for_decoding("fp32")
         return decoding.sample(self.tokenizer.quantised(latents), rngs_of(seeds), sampling.mask)
@@ -232,9 +232,6 @@ class Lidm(Generator[LidmConfig, LidmSampling]):
         read = replace(config, tokenizer=tokenizer, scale_latents=False)
         return read, {"tokenizer": first_stage, "denoiser": denoiser}
 
-    def _shares(self) -> Float[Tensor, "1000"]:
-        return latent_diffusion.signal_shares()
-
 
 class LatentDenoising(Objective):
     """The objective: the squared error of the predicted noise in the latents of a frozen tokenizer, at random steps."""
@@ -250,14 +247,13 @@ class LatentDenoising(Objective):
         tokenizer: CodebookTokenizer,
         denoiser: LatentUnet,
         latent_scale: Float[Tensor, ""],
-        shares: Float[Tensor, "1000"],
         axes: LatentAxes | None = None,
     ) -> None:
         super().__init__(tokenizer.sensor)
         self.denoiser = denoiser
         self._latents = EncodingCache(tokenizer, _latents)
         self.axes = axes
-        self.register_buffer("_shares", shares, persistent=False)
+        self.register_buffer("_shares", latent_diffusion.signal_shares(), persistent=False)
         self.register_buffer("latent_scale", latent_scale.clone())
 
     def forward(self, example: Example, rng: torch.Generator, player: str = "") -> dict[str, Tensor]:

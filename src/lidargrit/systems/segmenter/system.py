@@ -14,7 +14,7 @@ from lidargrit.generation.facts import Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective, hidden_in_some
 from lidargrit.generation.reflectance import TYPICAL_REFLECTANCE, required_reflectance
-from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, class_iou, labels_of, labels_to_learn
+from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, class_iou, labels_to_learn
 from lidargrit.nn.flops import FlopCounter
 from lidargrit.nn.precision import inference
 from lidargrit.nn.small_unet import Part, SmallUnet, SmallUnetConfig, check_size
@@ -160,12 +160,6 @@ def pair_counts(logits: Float[Tensor, "B 19 H W"], wanted: Int[Tensor, "B H W"])
     return logits.new_zeros(size**2).scatter_add(0, pairs, logits.new_ones(len(pairs))).view(size, size)
 
 
-def with_likeliest(images: RangeImage, of_class: Float[Tensor, "B 19 H W"]) -> RangeImage:
-    """Return images whose label is the likeliest class of each return, by SemanticKITTI's numbers."""
-    label = labels_of(of_class.argmax(1) + 1).to(images.range_m.device)
-    return images.with_planes(label=torch.where(images.return_mask, label, 0))
-
-
 @dataclass(frozen=True)
 class SegmenterConfig(Settings):
     """The network, which is the whole system."""
@@ -197,16 +191,6 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
     def objective(self, stage: str) -> Objective:
         """Return the errors of the classes."""
         return SegmenterObjective(self.segmenter, self.sensor)
-
-    @inference()
-    def segment(self, images: RangeImage) -> RangeImage:
-        """Return scans with the likeliest class of each return as its label, each scan computed by itself.
-
-        Args:
-            images: batch of range images (B, H, W); labels that they have are not read.
-        """
-        check_images(images, self.sensor)
-        return RangeImage.cat([with_likeliest(image, self.probabilities(image)) for image in one_by_one(images)])
 
     @inference()
     def probabilities(self, images: RangeImage) -> Float[Tensor, "B 19 H W"]:
