@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import whole_number
+from lidargrit.core.untrusted import WholeNumber
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
@@ -82,10 +82,13 @@ def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
 
 
 def add_count(
-    parser: argparse.ArgumentParser, default: int = 0, help: str = "number of scans, evenly spaced; 0 for all"
+    parser: argparse.ArgumentParser,
+    default: int = 0,
+    help: str = "number of scans, evenly spaced; 0 for all",
+    at_least: int = 0,
 ) -> None:
     """Add ``-n``/``--count``, the number of scans."""
-    parser.add_argument("-n", "--count", type=whole_number, default=default, metavar="N", help=help)
+    parser.add_argument("-n", "--count", type=WholeNumber(at_least), default=default, metavar="N", help=help)
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
@@ -93,7 +96,7 @@ def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
     rank = f"number of this {what}, from 0, if several share the work (default: $RANK, or 0)"
     parser.add_argument("--rank", type=int, help=rank)
     size = "how many share the work (default: $WORLD_SIZE, or 1); torchrun sets both"
-    parser.add_argument("--world-size", type=int, help=size)
+    parser.add_argument("--world-size", type=WholeNumber(1), help=size)
 
 
 def add_ray(parser: argparse.ArgumentParser) -> None:

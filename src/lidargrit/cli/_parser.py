@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from lidargrit.cli._catalogue import entries
 from lidargrit.core.errors import UsageError, nearest_names, one_of
-from lidargrit.core.untrusted import check_path, check_word, positive_number, whole_number
+from lidargrit.core.untrusted import Number, WholeNumber, check_path, check_word, whole_number
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake of the user (explained in one line),
@@ -57,7 +57,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *words: Any, **options: Any) -> None:
         super().__init__(*words, **options)
-        for kind, check in ((None, check_word), (Path, check_path), (int, whole_number), (float, positive_number)):
+        for kind, check in ((None, check_word), (Path, check_path), (int, whole_number), (float, Number())):
             self.register("type", kind, check)
 
     def error(self, message: str) -> NoReturn:
@@ -145,6 +145,10 @@ class Parser(argparse.ArgumentParser):
         return f"see: {self.prog} --help"
 
 
+def _is_number(action: argparse.Action) -> bool:
+    return action.type in (int, float) or isinstance(action.type, (Number, WholeNumber))
+
+
 def script(parser: Parser, shell: str) -> str:
     """Return the script of one shell; its verbs' names of presets, sensors, protocols and metrics are completed too."""
     import shtab
@@ -153,6 +157,6 @@ def script(parser: Parser, shell: str) -> str:
         for action in verb._actions:
             if action.dest in _KINDS:
                 action.choices = [entry["name"] for entry in entries(_KINDS[action.dest])]
-            elif action.choices is None and action.nargs != 0 and action.type not in (int, float):  # then a place
+            elif action.choices is None and action.nargs != 0 and not _is_number(action):  # but a place
                 action.complete = shtab.FILE  # pyright: ignore[reportAttributeAccessIssue]  shtab looks for it there
     return shtab.complete(parser, shell)

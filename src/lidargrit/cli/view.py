@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("scans", nargs="+", metavar="SCANS", help="source of scans: a file, a folder, samples, or a run")
     out = "picture (.png) or interactive page (.html) to write"
     add("-o", "--out", type=Path, default=Path("view.png"), help=out)
-    add_count(parser, 3, help="number of scans of each")
+    add_count(parser, 3, "number of scans of each", at_least=1)
     add("--seed", type=seed_number, default=0, help="seed of the first generated scan")
     colour = "colour of pixels: range, or anomaly for the bits beyond those expected"
     add("--color", choices=["range", "anomaly"], default="range", help=colour)

@@ -9,10 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import STEP_MM_AT_MOST
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-
-_COARSEST_MM = 1000
 
 
 @dataclass(frozen=True)
@@ -27,10 +26,10 @@ class RangeSteps:
     step_mm: int
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.step_mm, Integral) and 1 <= self.step_mm <= _COARSEST_MM):
+        if not (isinstance(self.step_mm, Integral) and 1 <= self.step_mm <= STEP_MM_AT_MOST):
             raise ConfigError(
                 f"a step of {self.step_mm} mm",
-                f"a whole number of millimetres from 1 to {_COARSEST_MM}",
+                f"a whole number of millimetres from 1 to {STEP_MM_AT_MOST}",
                 "take 10 for a centimetre",
             )
 
