@@ -30,6 +30,7 @@ MISTAKES = {
     "serve --seconds nan": "got --seconds nan; wanted a number from 0.001 to 86,400;",
     "compare out a --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
     "list metric": "wanted one such as metrics; see: lidargrit list --help",
+    "sample pretrained drive --path poses.txt": "got --path without --frames; wanted both; add --frames 20, or",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol or --projection; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
@@ -74,9 +75,13 @@ def test_a_mistake_in_the_words_is_told_in_one_line(words, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("word", ["", "  "])
-def test_an_empty_name_is_not_the_folder_one_stands_in(word, capsys):
+def test_a_blank_word_is_neither_the_folder_one_stands_in_nor_left_out(word, capsys):
     assert main(["simulate", word, "-n", "1"]) == 2
     assert f"got out {word!r}; wanted the name of a file or folder;" in capsys.readouterr().err
+    for words in ("serve --host", "sample a b --device", "complete a b --sensor", "rescan a b --to", "inspect"):
+        assert main([*words.split(), word]) == 2
+        name = "scans" if words == "inspect" else words.split()[-1]
+        assert f": got {name} {word!r}; wanted a name or a value; write one" in capsys.readouterr().err
 
 
 def test_what_follows_two_dashes_is_no_option(capsys):

@@ -74,6 +74,8 @@ def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
     """
     from lidargrit.data.prepared.config import ScanSettings
 
+    if options.path and not options.frames:
+        raise ConfigError("--path without --frames", "both", "add --frames 20, or leave --path out")
     for word in ("sensor", "frames"):
         if options.ray and getattr(options, word):
             raise ConfigError(f"--{word} {getattr(options, word)} with --ray", "one of them", "leave --ray out")

@@ -74,6 +74,13 @@ class Parser(argparse.ArgumentParser):
                 self.refuse(name)
         return super().parse_known_args(args, namespace)
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """Convert the words behind one option, or of one argument; a blank one is not taken to be left out."""
+        blank = [word for word in arg_strings if not word.strip()]
+        if blank and action.type is None and action.choices is None:
+            raise UsageError(f"{_name_of(action)} {blank[0]!r}", "a name or a value", "write one")
+        return super()._get_values(action, arg_strings)
+
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         """Convert one word; the message of our own types is kept, with the option's name before it."""
         if isinstance(action, argparse._SubParsersAction):  # all words of a verb, whose own parser converts them
@@ -82,8 +89,7 @@ class Parser(argparse.ArgumentParser):
         try:
             return convert(arg_string)
         except UsageError as error:
-            name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
-            raise UsageError(f"{name} {error.got}", error.wanted, error.cure) from None
+            raise UsageError(f"{_name_of(action)} {error.got}", error.wanted, error.cure) from None
 
     def short_usage(self) -> str:
         """Return the words that a command needs, in one line; its options are listed below it."""
@@ -143,6 +149,10 @@ class Parser(argparse.ArgumentParser):
 
     def _help(self) -> str:
         return f"see: {self.prog} --help"
+
+
+def _name_of(action: argparse.Action) -> str:
+    return action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
 
 
 def _is_number(action: argparse.Action) -> bool:
