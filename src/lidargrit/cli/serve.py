@@ -29,7 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from lidargrit.data.run_folder import named_folder
+    from lidargrit.data.run_folder import locate, named_folder, read_config
+
+    for run in options.runs:  # first, for the server takes long to load
+        read_config(locate(run))
     from lidargrit.viewer.serve import Limits, finished_runs, serve
 
     say = partial(print, flush=True)
