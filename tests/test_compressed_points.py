@@ -141,6 +141,8 @@ def test_the_commands_restore_points_with_other_threads_and_instructions(tmp_pat
     assert "--model with --points" in capsys.readouterr().err
     assert main(words) == 0
     assert "bits a point in steps of 20 mm" in capsys.readouterr().out
+    assert main(["decompress", file, here, "--model", "pretrained"]) == 2
+    assert f"got --model pretrained for {file}, which holds points; wanted no model; leave" in capsys.readouterr().err
     assert main(["decompress", file, here]) == 0
     features = "AVX512F AVX512CD AVX512_SKX AVX2 FMA3"
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": features, "ATEN_CPU_CAPABILITY": "default"}
