@@ -29,6 +29,7 @@ MISTAKES = {
     "serve --port -1": "got --port -1; wanted a whole number from 0 to 65,535;",
     "serve --seconds nan": "got --seconds nan; wanted a number from 0.001 to 86,400;",
     "compare out a --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
+    "view a -n -1": "got -n -1; wanted a whole number from 1 to 100;",
     "list metric": "wanted one such as metrics; see: lidargrit list --help",
     "sample pretrained drive --path poses.txt": "got --path without --frames; wanted both; add --frames 20, or",
     "demo --set": "got nothing after --set; wanted a value;",

@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import WholeNumber
+from lidargrit.core.untrusted import WholeNumber, whole_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
@@ -87,10 +87,10 @@ def add_count(
     parser: argparse.ArgumentParser,
     default: int = 0,
     help: str = "number of scans, evenly spaced; 0 for all",
-    at_least: int = 0,
+    number: WholeNumber = whole_number,
 ) -> None:
     """Add ``-n``/``--count``, the number of scans."""
-    parser.add_argument("-n", "--count", type=WholeNumber(at_least), default=default, metavar="N", help=help)
+    parser.add_argument("-n", "--count", type=number, default=default, metavar="N", help=help)
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:

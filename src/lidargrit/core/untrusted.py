@@ -23,6 +23,7 @@ STEPS_AT_MOST = 100_000  # of a sampler: a hundred times those of any published 
 SEARCH_STEPS_AT_MOST = 10_000  # of a search for latents, which keeps random numbers for each: ten times the published
 PROCESSES_AT_MOST = 1024  # on one machine
 FRAMES_AT_MOST = 100_000  # of a simulated drive, which are 20 to 220 km
+PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 STEP_MM_AT_MOST = 1000  # in which ranges are kept
 RAISED_AT_MOST_M = 10.0
 NUMBER_AT_MOST = 1e30  # operations of the largest training ever: 1e27
