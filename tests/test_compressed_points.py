@@ -98,7 +98,7 @@ def test_points_far_away_come_back_as_near_as_32_bits_can_say(at):
 def test_a_step_that_rounds_nothing_or_everything_is_refused(tmp_path, capsys, step_mm):
     words = ["compress", "simulated:1", str(tmp_path / "scans.lgz"), "--points", "--step-mm", step_mm]
     assert main(words) == 2
-    assert "wanted a whole number of millimetres from 1 to 1000" in capsys.readouterr().err
+    assert "wanted a whole number from 1 to 1,000" in capsys.readouterr().err
 
 
 def test_nothing_and_one_point_come_back_and_what_is_no_place_is_refused():
@@ -148,6 +148,8 @@ def test_the_commands_restore_points_with_other_threads_and_instructions(tmp_pat
     assert "--model with --points" in capsys.readouterr().err
     assert main(words) == 0
     assert "bits a point in steps of 20 mm" in capsys.readouterr().out
+    assert main(["decompress", file, here, "--model", "pretrained"]) == 2
+    assert f"got --model pretrained for {file}, which holds points; wanted no model; leave" in capsys.readouterr().err
     assert main(["decompress", file, here]) == 0
     features = "AVX512F AVX512CD AVX512_SKX AVX2 FMA3"
     environment = {**os.environ, "NPY_DISABLE_CPU_FEATURES": features, "ATEN_CPU_CAPABILITY": "default"}

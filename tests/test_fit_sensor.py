@@ -262,7 +262,11 @@ def test_the_verb_writes_a_sensor_and_a_picture_that_others_accept(folder, tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fit.png", "mine.json"]
 
 
-@pytest.mark.parametrize("arguments", [["-o", "mine.txt"], ["-n", "-1"], ["--name", " "]], ids=str)
+@pytest.mark.parametrize(
+    "arguments",
+    [["-o", "mine.txt"], ["-n", "-1"], ["--name", " "], ["--name", "vlp16"], ["-o", "os1_64.json"]],
+    ids=str,
+)
 def test_the_verb_refuses_wrong_words_in_one_line(folder, tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     assert main(["fit-sensor", str(folder), *arguments]) == 2

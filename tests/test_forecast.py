@@ -121,9 +121,13 @@ def test_a_drive_goes_on_by_its_own_poses_or_at_constant_speed(recorded):
     assert len(known.seen) == len(continued(recorded, forecaster(), 1, after=3, constant_speed=True).seen) == 2
 
 
-def test_what_cannot_be_forecast_is_told_in_one_line(run, recorded, tmp_path):
+def test_what_cannot_be_forecast_is_told_in_one_line(run, recorded, tmp_path, capsys):
     with pytest.raises(DataError, match=r"4 scans in a row .* --after 7; wanted two scans before the first forecast"):
         continued(recorded, forecaster(), 1, after=7, constant_speed=False)
+    for words in ([], ["--after", "3"]):
+        assert main(["forecast", "simulated:2", str(tmp_path / "out"), "--model", str(run), *words]) == 2
+        told = "got simulated:2 with 0 scans that have times and poses; wanted at least two in a row; put times.txt and"
+        assert told in capsys.readouterr().err
     (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n1 5 0 0 0 0 0 1\n")
     with pytest.raises(ConfigError, match=r"30 scans, 0.1 s apart, along .* which lasts 1.0 s"):
         path_of(30, tmp_path / "poses.txt")

@@ -315,7 +315,7 @@ def test_the_likelihood_of_a_source_is_told_and_its_map_written(tmp_path, capsys
     assert main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert main([*words[:4], "--step-mm", "0"]) == 2
-    assert "got a step of 0 mm; wanted a whole number of millimetres" in capsys.readouterr().err
+    assert "got --step-mm 0; wanted a whole number from 1 to 1,000" in capsys.readouterr().err
 
 
 def test_compare_tells_the_bits_of_whole_scans_where_a_system_has_them(tmp_path, capsys):

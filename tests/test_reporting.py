@@ -109,12 +109,26 @@ def test_silence_is_broken_by_a_line_and_only_silence(monkeypatch, capsys):
     assert len(lines) == 1
     time.sleep(0.5)
     assert len(text.getvalue().splitlines()) == 1, "after its end"
+    with reporter.never_silent("lidargrit serve", waits=True):
+        time.sleep(1.5)
+    assert len(text.getvalue().splitlines()) == 1, "of its waiting"
+    assert capsys.readouterr().err == "lidargrit serve loads its libraries\n"
     with reporter.never_silent("lidargrit train"):
         for _ in range(20):
             reporter.message("something")
             time.sleep(0.01)
     assert len(text.getvalue().splitlines()) == 21
     assert capsys.readouterr().err == ""
+
+
+def test_a_command_that_waits_says_that_it_loads(monkeypatch, capsys):
+    monkeypatch.setattr(reporting, "_SILENT_AT_FIRST_S", 0.0)
+    monkeypatch.setattr(cli, "_keep_freed_memory", lambda: None)
+    monkeypatch.delenv("RANK", raising=False)
+    assert cli._run(["serve", "nope"], is_program=True) == 2
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "lidargrit serve loads its libraries"
+    assert second.startswith("lidargrit serve: got nope, which does not exist; ")
 
 
 def test_a_reader_that_has_gone_ends_no_work(monkeypatch):

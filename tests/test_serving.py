@@ -181,6 +181,7 @@ def test_the_command_says_where_and_to_whom(tmp_path, capsys, monkeypatch):
         ["--seconds", "inf"],
         ["--port", "99999"],
         ["--host", "ü" * 70],
+        ["nope", "--port", "0"],  # by no worker process, which takes seconds to load
     ):
         assert main(["serve", *wrong]) == 2
         assert capsys.readouterr().err.startswith("lidargrit serve: got ")

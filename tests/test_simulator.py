@@ -196,7 +196,7 @@ def test_reflectance_is_a_share_and_differs_by_material():
 
 
 def test_settings_that_cannot_be_simulated_leave_no_folder_behind(tmp_path, capsys):
-    for words, message in ((["--wet", "2"], "wet 2.0"), (["--frames", "1000000"], "frames=1000000")):
+    for words, message in ((["--wet", "2"], "--wet 2"), (["--frames", "1000000"], "--frames 1000000")):
         assert main(["simulate", str(tmp_path / "out"), "-n", "2", *words]) == 2
         assert f"got {message}; " in capsys.readouterr().err
         assert not (tmp_path / "out").exists()

@@ -16,9 +16,10 @@ from lidargrit.core.configuration import override
 from lidargrit.core.errors import CheckpointError, ConfigError, DataError, LidarGritError, ScanError, UsageError
 from lidargrit.core.files import read_json, read_text, write_json
 from lidargrit.core.untrusted import (
+    Number,
+    WholeNumber,
     check_path,
     parse_json,
-    positive_number,
     seed_number,
     seeds_in_a_row,
     user_path,
@@ -79,7 +80,9 @@ def test_what_is_written_as_json_is_strict_json(tmp_path):
     [
         *((whole_number, word) for word in ("-1", "1e9", "99999999999999999999", "9" * 100_000, "", "x", "1.0")),
         *((seed_number, word) for word in (str(2**32), str(2**64), "-1", "x")),
-        *((positive_number, word) for word in ("nan", "inf", "1e400", "-1", "x", "1" * 400)),
+        *((WholeNumber(1, 9), word) for word in ("0", "10")),
+        *((Number(), word) for word in ("nan", "inf", "1e400", "-1", "x", "1" * 400)),
+        *((Number(-10.0, 10.0), word) for word in ("nan", "-inf", "-10.1", "10.1", "--1")),
         *((check_path, word) for word in ("", " ", "a\0b", "\udcff", "x" * 256, "a/" * 3000)),
     ],
 )
@@ -92,7 +95,7 @@ def test_words_that_are_refused_in_one_line(check, word):
 
 def test_words_that_are_accepted():
     assert (whole_number("0"), whole_number("10000000"), seed_number(str(2**32 - 1))) == (0, 10_000_000, 2**32 - 1)
-    assert (positive_number("2e14"), positive_number("0")) == (2e14, 0.0)
+    assert (Number()("2e14"), Number()("0"), Number(-10.0, 10.0)("-10")) == (2e14, 0.0, -10.0)
     assert check_path("/daten/Straße") == Path("/daten/Straße")
     assert user_path("~/x").is_absolute()
     with pytest.raises(DataError, match="a home folder that is not there"):

@@ -19,9 +19,19 @@ MISTAKES = {
     "sample run out more": "got the unexpected argument 'more'; wanted fewer arguments;",
     "sample run out -x": "got the option '-x'; wanted one such as",
     "simulate here -n two": "got -n 'two'; wanted a whole number;",
+    "simulate here -n -1": "got -n -1; wanted a whole number from 1 to 10,000,000; correct it",
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
+    "forecast a next -n 0": "got -n 0; wanted a whole number from 1 to",
+    "rescan a low --to vlp16 --raised-m nan": "got --raised-m nan; wanted a number from -10 to 10; correct it",
+    "compress a a.lgz --step-mm -5": "got --step-mm -5; wanted a whole number from 1 to 1,000; correct it",
+    "prepare a --rank 0 --world-size 0": "got --world-size 0; wanted a whole number from 1 to",
+    "prepare a --workers 2000": "got --workers 2000; wanted a whole number from 1 to 1,024;",
+    "serve --port -1": "got --port -1; wanted a whole number from 0 to 65,535;",
+    "serve --seconds nan": "got --seconds nan; wanted a number from 0.001 to 86,400;",
     "compare out a --table pdf": "got --table pdf; wanted text, markdown or latex; choose one",
+    "view a -n -1": "got -n -1; wanted a whole number from 1 to 100;",
     "list metric": "wanted one such as metrics; see: lidargrit list --help",
+    "sample pretrained drive --path poses.txt": "got --path without --frames; wanted both; add --frames 20, or",
     "demo --set": "got nothing after --set; wanted a value;",
     "evaluate --pr x": "got --pr; wanted --protocol or --projection; write it out",
     "view a --overwrite=3": "got --overwrite with 3; wanted --overwrite alone;",
@@ -66,9 +76,13 @@ def test_a_mistake_in_the_words_is_told_in_one_line(words, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("word", ["", "  "])
-def test_an_empty_name_is_not_the_folder_one_stands_in(word, capsys):
+def test_a_blank_word_is_neither_the_folder_one_stands_in_nor_left_out(word, capsys):
     assert main(["simulate", word, "-n", "1"]) == 2
     assert f"got out {word!r}; wanted the name of a file or folder;" in capsys.readouterr().err
+    for words in ("serve --host", "sample a b --device", "complete a b --sensor", "rescan a b --to", "inspect"):
+        assert main([*words.split(), word]) == 2
+        name = "scans" if words == "inspect" else words.split()[-1]
+        assert f": got {name} {word!r}; wanted a name or a value; write one" in capsys.readouterr().err
 
 
 def test_what_follows_two_dashes_is_no_option(capsys):
@@ -138,6 +152,7 @@ def test_a_shell_learns_all_verbs_and_what_may_follow(shell, capsys, tmp_path):
     script.write_text(capsys.readouterr().out)
     for word in (*discovery.names("cli"), *discovery.names("presets"), "lidargrit-kitti-360", "dry-run"):
         assert word in script.read_text() or word.replace("_", "-") in script.read_text()
+    assert "prepare___workers_COMPGEN" not in script.read_text(), "no file stands where a number does"
     if shutil.which(shell):
         subprocess.run([shell, "-n", str(script)], check=True)
 

@@ -209,7 +209,7 @@ def test_a_sensor_that_does_not_fit_the_scan(refused, tmp_path):
             ["train", "lidargrit_demo", "OUT", "--set", "training.tokenizer.average_over_scans=-1"],
             r"average_over_scans=-1; wanted",
         ),
-        (["sample", "RUN", "OUT", "-n", "0"], r"-n 0; wanted at least one scan"),
+        (["sample", "RUN", "OUT", "-n", "0"], r"-n 0; wanted a whole number from 1 "),
         (["sample", "RUN", "OUT", "--seed", "-1"], r"--seed -1; wanted"),
         (["sample", "RUN", "OUT", "--set", "sampling.top_p=0"], r"top_p=0; wanted"),
         (["sample", "RUN", "OUT", "--set", "sampling.temperature=nan"], r"temperature=nan; wanted a number, at least"),

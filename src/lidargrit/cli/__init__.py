@@ -59,8 +59,8 @@ def _run(words: list[str], is_program: bool = False) -> int:
         options.run = lambda _: print(told)
     try:
         reporter = reporting.TerminalReporter()
-        tells = is_program and options.verb and not options.waits and os.environ.get("RANK", "0") == "0"
-        aloud = reporter.never_silent(f"lidargrit {options.verb}") if tells else nullcontext()
+        tells = is_program and options.verb and os.environ.get("RANK", "0") == "0"
+        aloud = reporter.never_silent(f"lidargrit {options.verb}", options.waits) if tells else nullcontext()
         with _refusing_unusable_paths(), reporting.to(reporter), aloud:
             _refuse_to_replace_what_is_read(options)
             options.run(options)

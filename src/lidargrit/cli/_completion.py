@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from lidargrit.cli._options import add_count, add_device, add_scans, sampling_words, scan_settings
 from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import seed_number, whole_number
+from lidargrit.core.untrusted import WholeNumber, seed_number
 
 if TYPE_CHECKING:
     from lidargrit.data.run_folder import Job
@@ -28,7 +28,7 @@ def add_completion(parser: argparse.ArgumentParser, model: str, points_only: boo
     parser.add_argument("--model", default="pretrained", help=model)
     add_count(parser)
     each = "number of completions of each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
-    parser.add_argument("--samples", type=whole_number, default=1, help=each)
+    parser.add_argument("--samples", type=WholeNumber(1), default=1, help=each)
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first completion")
     kind = "format of the clouds, a name from: lidargrit list formats (default: that of each scan's file); or image "
     parser.add_argument("--format", default="", help=kind + "for the model's range images alone, as .npy")

@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import whole_number
+from lidargrit.core.untrusted import WholeNumber, whole_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
@@ -74,6 +74,8 @@ def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
     """
     from lidargrit.data.prepared.config import ScanSettings
 
+    if options.path and not options.frames:
+        raise ConfigError("--path without --frames", "both", "add --frames 20, or leave --path out")
     for word in ("sensor", "frames"):
         if options.ray and getattr(options, word):
             raise ConfigError(f"--{word} {getattr(options, word)} with --ray", "one of them", "leave --ray out")
@@ -82,10 +84,13 @@ def sensor_of(options: argparse.Namespace) -> "SensorModel | None":
 
 
 def add_count(
-    parser: argparse.ArgumentParser, default: int = 0, help: str = "number of scans, evenly spaced; 0 for all"
+    parser: argparse.ArgumentParser,
+    default: int = 0,
+    help: str = "number of scans, evenly spaced; 0 for all",
+    number: WholeNumber = whole_number,
 ) -> None:
     """Add ``-n``/``--count``, the number of scans."""
-    parser.add_argument("-n", "--count", type=whole_number, default=default, metavar="N", help=help)
+    parser.add_argument("-n", "--count", type=number, default=default, metavar="N", help=help)
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
@@ -93,7 +98,7 @@ def add_rank(parser: argparse.ArgumentParser, what: str) -> None:
     rank = f"number of this {what}, from 0, if several share the work (default: $RANK, or 0)"
     parser.add_argument("--rank", type=int, help=rank)
     size = "how many share the work (default: $WORLD_SIZE, or 1); torchrun sets both"
-    parser.add_argument("--world-size", type=int, help=size)
+    parser.add_argument("--world-size", type=WholeNumber(1), help=size)
 
 
 def add_ray(parser: argparse.ArgumentParser) -> None:

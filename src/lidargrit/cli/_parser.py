@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from lidargrit.cli._catalogue import entries
 from lidargrit.core.errors import UsageError, nearest_names, one_of
-from lidargrit.core.untrusted import check_path, check_word, positive_number, whole_number
+from lidargrit.core.untrusted import Number, WholeNumber, check_path, check_word, whole_number
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake of the user (explained in one line),
@@ -57,7 +57,7 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *words: Any, **options: Any) -> None:
         super().__init__(*words, **options)
-        for kind, check in ((None, check_word), (Path, check_path), (int, whole_number), (float, positive_number)):
+        for kind, check in ((None, check_word), (Path, check_path), (int, whole_number), (float, Number())):
             self.register("type", kind, check)
 
     def error(self, message: str) -> NoReturn:
@@ -74,6 +74,13 @@ class Parser(argparse.ArgumentParser):
                 self.refuse(name)
         return super().parse_known_args(args, namespace)
 
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        """Convert the words behind one option, or of one argument; a blank one is not taken to be left out."""
+        blank = [word for word in arg_strings if not word.strip()]
+        if blank and action.type is None and action.choices is None:
+            raise UsageError(f"{_name_of(action)} {blank[0]!r}", "a name or a value", "write one")
+        return super()._get_values(action, arg_strings)
+
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         """Convert one word; the message of our own types is kept, with the option's name before it."""
         if isinstance(action, argparse._SubParsersAction):  # all words of a verb, whose own parser converts them
@@ -82,8 +89,7 @@ class Parser(argparse.ArgumentParser):
         try:
             return convert(arg_string)
         except UsageError as error:
-            name = action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
-            raise UsageError(f"{name} {error.got}", error.wanted, error.cure) from None
+            raise UsageError(f"{_name_of(action)} {error.got}", error.wanted, error.cure) from None
 
     def short_usage(self) -> str:
         """Return the words that a command needs, in one line; its options are listed below it."""
@@ -145,6 +151,14 @@ class Parser(argparse.ArgumentParser):
         return f"see: {self.prog} --help"
 
 
+def _name_of(action: argparse.Action) -> str:
+    return action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
+
+
+def _is_number(action: argparse.Action) -> bool:
+    return action.type in (int, float) or isinstance(action.type, (Number, WholeNumber))
+
+
 def script(parser: Parser, shell: str) -> str:
     """Return the script of one shell; its verbs' names of presets, sensors, protocols and metrics are completed too."""
     import shtab
@@ -153,6 +167,6 @@ def script(parser: Parser, shell: str) -> str:
         for action in verb._actions:
             if action.dest in _KINDS:
                 action.choices = [entry["name"] for entry in entries(_KINDS[action.dest])]
-            elif action.choices is None and action.nargs != 0 and action.type not in (int, float):  # then a place
+            elif action.choices is None and action.nargs != 0 and not _is_number(action):  # but a place
                 action.complete = shtab.FILE  # pyright: ignore[reportAttributeAccessIssue]  shtab looks for it there
     return shtab.complete(parser, shell)

@@ -6,7 +6,7 @@ from pathlib import Path
 from lidargrit.cli._comparison import COMPLETED, DEFAULTS, compared
 from lidargrit.cli._options import add_device, add_scans
 from lidargrit.cli._results import add_json, add_table, print_result, refuse_taken
-from lidargrit.core.untrusted import seed_number, whole_number
+from lidargrit.core.untrusted import WholeNumber, process_count, seed_number, whole_number
 
 EXAMPLES = """\
   lidargrit compare table lidargrit_small r2dm_small --flops 2e14 -n 1000      equal compute for all
@@ -32,13 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--protocol", metavar="NAME", help=protocol)
     add("--metrics", nargs="+", metavar="NAME", help="others than the protocol's: lidargrit list metrics")
     add("--flops", type=float, metavar="N", help="training operations of each system (default: its own)")
-    add("--workers", type=int, default=1, metavar="N", help="number of systems made at the same time")
-    add("--paper-table", type=int, metavar="N", help="table 1, 2 or 3 of the paper")
+    add("--workers", type=process_count, default=1, metavar="N", help="number of systems made at the same time")
+    add("--paper-table", type=WholeNumber(1, 3), metavar="N", help="table 1, 2 or 3 of the paper")
     add("--data", default="", metavar="ROOT", help="data set of the paper table, or the word simulated")
     add("--small", action="store_true", help="small presets for the paper table")
     add("--dry-run", action="store_true", help="print what the paper table takes, and stop")
     add("--observed", nargs="+", default=[], metavar="PATTERN", help="what completion is given, as of complete")
-    add("--samples", type=int, default=2, metavar="N", help="number of completions of each scan")
+    add("--samples", type=WholeNumber(1), default=2, metavar="N", help="number of completions of each scan")
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of completions and of random pixels")
     add_scans(parser, "settings of all presets, or of reading scans")
     add_device(parser)

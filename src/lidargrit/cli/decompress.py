@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("file", type=Path, metavar="FILE.lgz", help="file that lidargrit compress wrote")
     add("out", type=Path, help="folder for the scans: empty, or begun by the same command")
-    add("--model", default="pretrained", help="run by which it was compressed (default: pretrained)")
+    add("--model", help="run by which it was compressed (default: pretrained)")
     kind = "image for range images (H, W) in metres as .npy (default; of --points: bin), or bin, pcd, ply, npz, or a "
     add("--format", help=kind + "name from: lidargrit list formats")
     only = "indices of the scans that are wanted, from 0; all if not given"

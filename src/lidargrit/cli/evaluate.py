@@ -6,7 +6,7 @@ from pathlib import Path
 from lidargrit.cli._evaluation import evaluated
 from lidargrit.cli._options import add_count, add_device, add_ray, add_scans
 from lidargrit.cli._results import add_json, files_told, print_result, refuse_taken
-from lidargrit.core.untrusted import seed_number
+from lidargrit.core.untrusted import WholeNumber, seed_number
 
 EXAMPLES = """\
   lidargrit evaluate samples /data/held_out --report report.html
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_count(parser, help="largest number of scans; 0 for the protocol's")
     add("--intervals", type=int, default=20, metavar="B", help="half-samples for 95 %% intervals; 0 for none")
     add("--pixel-statistics", action="store_true", help="also score pixel statistics, which models must beat")
-    add("--groups", type=int, default=16, metavar="G", help="groups of scans in half-samples")
+    add("--groups", type=WholeNumber(4), default=16, metavar="G", help="groups of scans in half-samples")
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of all random choices")
     add_device(parser)
     add_ray(parser)

@@ -6,7 +6,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_device, add_settings, sampling_words
 from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import seed_number, whole_number
+from lidargrit.core.untrusted import WholeNumber, seed_number, whole_number
 
 EXAMPLES = """\
   lidargrit forecast kitti_odometry:/data/kitti_odometry:00 next       ten scans after its last
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("drive", help="source of the scans of a drive with times and poses")
     add("out", type=Path, help="folder for the scans; the same command continues there")
     add("--model", type=Path, default=Path("pretrained"), help="a finished run that takes a past (default: pretrained)")
-    add("-n", "--count", type=whole_number, default=10, metavar="N", help="number of scans")
+    add("-n", "--count", type=WholeNumber(1), default=10, metavar="N", help="number of scans")
     add("--after", type=whole_number, metavar="SCAN", help="number of the last scan that is seen, from 0")
     add("--constant-speed", action="store_true", help="repetition of the last step, though later poses are known")
     add("--seed", type=seed_number, default=0, help="seed of the drive")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
+from lidargrit.core.untrusted import step_in_mm
 
 EXAMPLES = """\
   lidargrit likelihood simulated:64:test
@@ -17,7 +18,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scans", help="source of scans: a file's folder, NAME:ROOT:SPLIT, samples, or prepared scans")
     add("--model", default="pretrained", help="run whose probabilities count (default: pretrained)")
-    add("--step-mm", type=int, default=10, metavar="MM", help="step in millimetres that ranges are rounded to first")
+    step = {"type": step_in_mm, "default": 10, "metavar": "MM"}
+    add("--step-mm", **step, help="step in millimetres that ranges are rounded to first")
     add_count(parser)
     bits = "also write the bits of every pixel: float32 (scans, rows, columns)"
     add("--map", type=Path, metavar="FILE.npy", help=bits)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lidargrit.cli._options import add_count, add_rank, add_ray, add_scans, ray_address, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
+from lidargrit.core.untrusted import process_count
 
 EXAMPLES = """\
   lidargrit prepare kitti_360:/data/KITTI-360:train -o /fast/kitti_360_train --workers 16
@@ -23,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", type=Path, help=out)
     add_count(parser)
     add_scans(parser)
-    parser.add_argument("--workers", type=int, help="number of processes on this machine (default: 2)")
+    parser.add_argument("--workers", type=process_count, help="number of processes on this machine (default: 2)")
     add_rank(parser, "machine")
     add_ray(parser)
     parser.add_argument("--verify", action="store_true", help="also read all back, and prepare damaged parts anew")

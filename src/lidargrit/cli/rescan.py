@@ -6,7 +6,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_count, add_scans, scan_settings
 from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import signed_number
+from lidargrit.core.untrusted import RAISED_AT_MOST_M, Number
 
 EXAMPLES = """\
   lidargrit rescan kitti_odometry:/data/kitti:00 sparse --to vlp16              64 rows to 16
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument("--to", required=True, help="name or .json file of the sensor whose scans are wanted")
     raised = "height of the wanted sensor above the one that made the scans, in metres"
-    parser.add_argument("--raised-m", type=signed_number, default=0.0, help=raised)
+    parser.add_argument("--raised-m", type=Number(-RAISED_AT_MOST_M, RAISED_AT_MOST_M), default=0.0, help=raised)
     formats = "format of the files: bin, pcd, ply, las, npz, or kitti_odometry for a tree with labels"
     parser.add_argument("--format", default="kitti_bin", help=formats)
     add_count(parser)

@@ -7,7 +7,7 @@ from pathlib import Path
 from lidargrit.cli._options import add_device, add_rank, add_ray, add_settings, ray_address, sampling_words, sensor_of
 from lidargrit.cli._results import look_at
 from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import seed_number, seeds_in_a_row, whole_number
+from lidargrit.core.untrusted import WholeNumber, seed_number, seeds_in_a_row, whole_number
 
 EXAMPLES = """\
   lidargrit sample pretrained samples                     by a model that comes with the package, 64x256
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(goes_on=True)
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="a finished run, pretrained or pretrained_wide")
     parser.add_argument("out", type=Path, help="folder for the samples; the same command continues there")
-    parser.add_argument("-n", "--count", type=int, default=16, help="number of scans")
+    parser.add_argument("-n", "--count", type=WholeNumber(1), default=16, help="number of scans")
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first scan; the next has the next")
     parser.add_argument("--sensor", default="", help="name or .json of another sensor, for a run that takes any")
     parser.add_argument("--frames", type=whole_number, default=0, metavar="N", help="scans in a row of each drive")

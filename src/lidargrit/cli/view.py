@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
-from lidargrit.core.untrusted import seed_number
+from lidargrit.core.untrusted import PAGE_SCANS_AT_MOST, WholeNumber, seed_number
 
 EXAMPLES = """\
   lidargrit view /data/scans                           range image, return mask and bird's-eye view
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("scans", nargs="+", metavar="SCANS", help="source of scans: a file, a folder, samples, or a run")
     out = "picture (.png) or interactive page (.html) to write"
     add("-o", "--out", type=Path, default=Path("view.png"), help=out)
-    add_count(parser, 3, help="number of scans of each")
+    add_count(parser, 3, "number of scans of each", WholeNumber(1, PAGE_SCANS_AT_MOST))
     add("--seed", type=seed_number, default=0, help="seed of the first generated scan")
     colour = "colour of pixels: range, or anomaly for the bits beyond those expected"
     add("--color", choices=["range", "anomaly"], default="range", help=colour)

@@ -16,8 +16,7 @@ from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.process import BaseProcess
 
 from lidargrit.core.errors import ConfigError, DataError
-
-PROCESSES_AT_MOST = 1024  # on one machine
+from lidargrit.core.untrusted import PROCESSES_AT_MOST
 
 
 def rank_and_world_size(rank: int | None = None, world_size: int | None = None) -> tuple[int, int]:
@@ -45,14 +44,6 @@ def module_command(module: str, *words: str) -> list[str]:
     return [sys.executable, "-P", "-m", module, *words]
 
 
-def check_processes(count: int) -> None:
-    """Raise ConfigError for less than one process, or more than :data:`PROCESSES_AT_MOST`."""
-    if not 1 <= count <= PROCESSES_AT_MOST:
-        raise ConfigError(
-            f"{count} processes", f"1 to {PROCESSES_AT_MOST:,}", "choose about as many as there are cores"
-        )
-
-
 @contextmanager
 def process_pool(count: int, begin: Callable[[], None] | None = None) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool of processes that import no file of the current folder.
@@ -60,7 +51,10 @@ def process_pool(count: int, begin: Callable[[], None] | None = None) -> Iterato
     If the block fails or is interrupted, they are terminated. If this process is killed, they end by themselves: they
     would else go on to write into a folder that nobody holds any more.
     """
-    check_processes(count)
+    if not 1 <= count <= PROCESSES_AT_MOST:
+        raise ConfigError(
+            f"{count} processes", f"1 to {PROCESSES_AT_MOST:,}", "choose about as many as there are cores"
+        )
     before = {*active_children()}
     try:
         with _safe_import_path(), ProcessPoolExecutor(count, get_context("spawn"), _begin, (begin,)) as pool:

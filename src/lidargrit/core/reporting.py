@@ -140,8 +140,12 @@ class TerminalReporter(Reporter):
         self._said_s = time.monotonic()
 
     @contextmanager
-    def never_silent(self, command: str) -> Iterator[None]:
-        """Say within the block that work goes on, wherever nothing else is said for ten seconds, or two at first."""
+    def never_silent(self, command: str, waits: bool = False) -> Iterator[None]:
+        """Say within the block that work goes on, wherever nothing else is said for ten seconds, or two at first.
+
+        Args:
+            waits: whether the command then waits for others, in silence.
+        """
         ended, begun_s = threading.Event(), time.monotonic()
         self._said_s = begun_s
 
@@ -151,7 +155,7 @@ class TerminalReporter(Reporter):
                 with suppress(OSError):  # not by rich, which has yet to be loaded itself
                     print(f"{command} loads its libraries", file=sys.stderr, flush=True)
             at_most_s = _SILENT_S_AT_MOST - _MARGIN_S
-            while not ended.wait(max(0.0, self._said_s + at_most_s - time.monotonic())):
+            while not waits and not ended.wait(max(0.0, self._said_s + at_most_s - time.monotonic())):
                 if time.monotonic() - self._said_s >= at_most_s:
                     self.message(f"{command} is still at work, begun {_minutes(time.monotonic() - begun_s)} ago")
 

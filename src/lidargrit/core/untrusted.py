@@ -6,6 +6,7 @@ All bounds of what a command line, a JSON file or a message may ask for stand he
 import json
 import math
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -20,6 +21,11 @@ COUNT_AT_MOST = 10_000_000  # scans, columns, steps, processes: ten times the la
 TEMPERATURE_AT_LEAST = 1e-6  # besides 0: by a smaller one, logits and densities overflow
 STEPS_AT_MOST = 100_000  # of a sampler: a hundred times those of any published one
 SEARCH_STEPS_AT_MOST = 10_000  # of a search for latents, which keeps random numbers for each: ten times the published
+PROCESSES_AT_MOST = 1024  # on one machine
+FRAMES_AT_MOST = 100_000  # of a simulated drive, which are 20 to 220 km
+PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
+STEP_MM_AT_MOST = 1000  # in which ranges are kept
+RAISED_AT_MOST_M = 10.0
 NUMBER_AT_MOST = 1e30  # operations of the largest training ever: 1e27
 PATH_BYTES_AT_MOST = 4096  # Linux; others allow less
 NAME_BYTES_AT_MOST = 255  # of one file or folder, on all common file systems
@@ -108,46 +114,52 @@ def user_path(text: str, error: type[LidarGritError] = DataError) -> Path:
         raise error(why.got, why.wanted, why.cure) from None
 
 
-def whole_number(word: str, at_most: int = COUNT_AT_MOST) -> int:
-    """Return a whole number from 0 on."""
-    try:
-        value = int(word) if len(word) <= 40 else -1  # Python needs quadratic time for long ones
-    except ValueError:
-        raise UsageError(repr(word), "a whole number", "correct it") from None
-    if not 0 <= value <= at_most:
-        raise UsageError(word[:40], f"a whole number from 0 to {at_most:,}", "correct it")
-    return value
+@dataclass(frozen=True)
+class WholeNumber:
+    """A word → a whole number within bounds; UsageError names the bounds."""
+
+    at_least: int = 0
+    at_most: int = COUNT_AT_MOST
+
+    def __call__(self, word: str) -> int:
+        """Return the number."""
+        try:
+            value = int(word) if len(word) <= 40 else -1  # Python needs quadratic time for long ones
+        except ValueError:
+            raise UsageError(repr(word), "a whole number", "correct it") from None
+        if not self.at_least <= value <= self.at_most:
+            raise UsageError(word[:40], f"a whole number from {self.at_least} to {self.at_most:,}", "correct it")
+        return value
 
 
-def seed_number(word: str) -> int:
-    """Return a seed, from 0 to :data:`SEED_AT_MOST`, or raise UsageError as :func:`whole_number`."""
-    return whole_number(word, SEED_AT_MOST)
+whole_number, seed_number = WholeNumber(), WholeNumber(at_most=SEED_AT_MOST)
+process_count, step_in_mm = WholeNumber(1, PROCESSES_AT_MOST), WholeNumber(1, STEP_MM_AT_MOST)
 
 
 def seeds_in_a_row(first: int, count: int) -> range:
     """Return the seeds of a number of scans from a first one on, the next scan with the next seed."""
-    if count < 1:
-        raise UsageError(f"-n {count}", "at least one scan", "raise it")
     if first + count - 1 > SEED_AT_MOST:
         got = f"--seed {first} with -n {count}, of which the last scan has the seed {first + count - 1}"
         raise UsageError(got, f"seeds up to {SEED_AT_MOST}", "lower one of the two")
     return range(first, first + count)
 
 
-def positive_number(word: str) -> float:
-    """Return a number from 0 on that is neither NaN nor infinite."""
-    try:
-        value = float(word)
-    except ValueError:
-        raise UsageError(repr(word[:40]), "a number", "correct it") from None
-    if not 0 <= value <= NUMBER_AT_MOST:  # refuses NaN too
-        raise UsageError(word[:40], f"a number from 0 to {NUMBER_AT_MOST:g}", "correct it")
-    return value
+@dataclass(frozen=True)
+class Number:
+    """A word → a number within bounds, neither NaN nor infinite; UsageError names the bounds."""
 
+    at_least: float = 0.0
+    at_most: float = NUMBER_AT_MOST
 
-def signed_number(word: str) -> float:
-    """Return a number of either sign; see :func:`positive_number`."""
-    return -positive_number(word[1:]) if word.startswith("-") else positive_number(word)
+    def __call__(self, word: str) -> float:
+        """Return the number."""
+        try:
+            value = float(word)
+        except ValueError:
+            raise UsageError(repr(word[:40]), "a number", "correct it") from None
+        if not self.at_least <= value <= self.at_most:  # refuses NaN too
+            raise UsageError(word[:40], f"a number from {self.at_least:g} to {self.at_most:,g}", "correct it")
+        return value
 
 
 _JSON_NAMES: dict[type, str] = {

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ConfigError, DataError, counted_scans
+from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.files import (
     atomic_path,
     claim_folder,
@@ -17,13 +17,14 @@ from lidargrit.core.files import (
     write_json,
 )
 from lidargrit.core.shares import each_done
+from lidargrit.core.untrusted import FRAMES_AT_MOST
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.datasets.shared.odometry import num_poses, write_motions
 from lidargrit.data.datasets.shared.streets import STREETS_VERSION
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.scan_folder import begun_by, write_sensor
 from lidargrit.scans.sensors import SensorModel, load_sensor
-from lidargrit.simulator import FRAME_S, FRAMES_AT_MOST, Theme, check_settings, observe, poses_of
+from lidargrit.simulator import FRAME_S, Theme, check_settings, observe, poses_of
 
 MANIFEST = "simulated.json"
 _SHARE, _SHARE_ON_RAY = 4, 16  # scans: seconds of work, for a task takes a cluster 30 ms
@@ -91,12 +92,6 @@ def write_drives(out: Path, num_scans: int, config: DriveConfig, workers: int = 
     Returns:
         Number of scans that are there now.
     """
-    if num_scans < 1 or workers < 1:
-        raise ConfigError(
-            f"{counted_scans(num_scans)} by {workers} process{'' if workers == 1 else 'es'}",
-            "at least one of each",
-            "correct it",
-        )
     with claim_folder(out), claimed_manifest(out / MANIFEST):
         _claim(out, config)
         there = max(num_scans, _last_scan(out, config) + 1)  # an earlier call may have made more

@@ -18,7 +18,7 @@ from lidargrit.core import reporting
 from lidargrit.core.configuration import name_and_settings
 from lidargrit.core.errors import ConfigError, LidarGritError
 from lidargrit.core.files import claim_folder, read_json, write_json
-from lidargrit.core.processes import check_processes, process_pool
+from lidargrit.core.processes import process_pool
 from lidargrit.core.table import Format, render
 from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import is_run, locate, weights_sha256
@@ -105,7 +105,6 @@ def run(systems: Sequence[str], folder: Path, comparison: CompareConfig, process
         raise ConfigError(
             f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
         )
-    check_processes(processes)
     # Wrong words and runs of other presets are refused before anything is trained.
     plans = [_SystemJob.of(system, folder, comparison) for system in systems]
     reference = open_source(comparison.reference, comparison.settings.data.bad_points)

@@ -9,17 +9,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import STEP_MM_AT_MOST
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
-
-_COARSEST_MM = 1000
-
-
-def check_step(step_mm: int) -> None:
-    """Raise ConfigError if values are not to be rounded to such steps."""
-    if not (isinstance(step_mm, Integral) and 1 <= step_mm <= _COARSEST_MM):
-        wanted = f"a whole number of millimetres from 1 to {_COARSEST_MM}"
-        raise ConfigError(f"a step of {step_mm} mm", wanted, "take 10 for a centimetre")
 
 
 @dataclass(frozen=True)
@@ -34,7 +26,12 @@ class RangeSteps:
     step_mm: int
 
     def __post_init__(self) -> None:
-        check_step(self.step_mm)
+        if not (isinstance(self.step_mm, Integral) and 1 <= self.step_mm <= STEP_MM_AT_MOST):
+            raise ConfigError(
+                f"a step of {self.step_mm} mm",
+                f"a whole number of millimetres from 1 to {STEP_MM_AT_MOST}",
+                "take 10 for a centimetre",
+            )
 
     @property
     def first(self) -> int:

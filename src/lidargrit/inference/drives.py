@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
-from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.run_folder import locate
@@ -105,10 +105,13 @@ def continued(drive: str, generator: Generator[Any, Any], frames: int, after: in
     dataset = open_source(drive).scans()
     scans = dataset.timed_scans()
     numbers = max(drives_in(scans), key=lambda one: (len(one) > 1, one[-1:]), default=[])
+    if len(numbers) < 2:
+        got = f"{drive} with {counted_scans(len(numbers))} that have times and poses"
+        raise DataError(got, "at least two in a row", "put times.txt and poses.txt beside them")
     last = len(numbers) - 1 if after is None else after
     if not 1 <= last < len(numbers):
         got = f"{drive} with {len(numbers)} scans in a row that have times and poses, and --after {last}"
-        raise DataError(got, "two scans before the first forecast", f"--after 1 to {max(1, len(numbers) - 1)}")
+        raise DataError(got, "two scans before the first forecast", f"--after 1 to {len(numbers) - 1}")
     motions = [scans[number].motion for number in numbers]
     times_s = [motion.time_s or 0.0 for motion in motions]
     known = [motion.pose for motion in motions if motion.pose is not None]  # all of a drive's have one

@@ -10,12 +10,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.core.untrusted import RAISED_AT_MOST_M
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
 _BESIDE = 0.75  # of the spacing of rays: two rays of the cloud are never farther from a ray between them
 _CANDIDATES = 8  # nearest points of which the one in front hides the others, once the sensor has moved
-_RAISED_AT_MOST_M = 10.0
 
 
 class Rescanned(NamedTuple):
@@ -57,8 +57,8 @@ class Rescan:
     raised_m: float = 0.0
 
     def __post_init__(self) -> None:
-        if not abs(self.raised_m) <= _RAISED_AT_MOST_M:
-            wanted = f"{-_RAISED_AT_MOST_M:g} to {_RAISED_AT_MOST_M:g} metres"
+        if not abs(self.raised_m) <= RAISED_AT_MOST_M:
+            wanted = f"{-RAISED_AT_MOST_M:g} to {RAISED_AT_MOST_M:g} metres"
             raise ConfigError(f"a sensor raised by {self.raised_m:g} m", wanted, "correct it")
 
     def identity(self) -> dict[str, Any]:

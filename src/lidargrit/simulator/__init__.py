@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import FRAMES_AT_MOST
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S
@@ -33,7 +34,6 @@ __all__ = [
 ]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
-FRAMES_AT_MOST = 100_000  # of a drive, which are 20 to 220 km
 ROAD_M = 100.0  # that our car drives in a street that ends: .97 of the returns are still there, after 140 m .17
 _HDL64E_OF_KITTI = RaydropModel()
 _DEFAULT = "hdl64e_kitti_odometry"

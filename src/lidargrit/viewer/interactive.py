@@ -27,7 +27,6 @@ from lidargrit.scans.types import Scan
 from lidargrit.viewer._page import asset, document, part
 from lidargrit.viewer.scan_sets import ANOMALOUS_BITS, ScanSet
 
-PAGE_SCANS_AT_MOST = 100  # of each source: about 15 MB of a KITTI-360 size image, which browsers still open at once
 SOURCES_AT_MOST = 8  # browsers keep 8 to 16 WebGL canvases alive
 _SCRIPTS = ("scans.js", "camera.js", "points.js", "files.js", "pane.js", "page.js")  # of every page that shows scans
 _RANGE_STEPS = 65_535  # 16 bits, of which 0 is no return

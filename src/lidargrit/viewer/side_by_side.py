@@ -6,9 +6,10 @@ from pathlib import Path
 
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.untrusted import PAGE_SCANS_AT_MOST
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.generation.generator import load
-from lidargrit.viewer.interactive import PAGE_SCANS_AT_MOST, write_page
+from lidargrit.viewer.interactive import write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
 from lidargrit.viewer.scan_sets import ScanSet, load_scan_sets
 

@@ -50,12 +50,6 @@ class OutputConfig:
     format: str = ""
     probability: int = 0
 
-    def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ConfigError(f"--samples {self.count}", "at least 1 completion of each scan", "raise it")
-        if self.probability < 0:
-            raise ConfigError(f"--probability {self.probability}", "0 or more samples", "raise it")
-
 
 @dataclass(frozen=True)
 class Written:

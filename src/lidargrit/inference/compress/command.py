@@ -168,7 +168,7 @@ def _write_some(work: _Work, folder: Path, indices: Sequence[int]) -> int:
     return _compressor_of(work).write(folder, indices)
 
 
-def decompress_scans(path: Path, out: Path, model: str, kind: str | None, chosen: Sequence[int]) -> int:
+def decompress_scans(path: Path, out: Path, model: str | None, kind: str | None, chosen: Sequence[int]) -> int:
     """Write the scans of a compressed file as they were, and return their number.
 
     The whole file is checked before anything is written, and each scan's pixels before its own file.
@@ -176,12 +176,14 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str | None, chosen
     Args:
         path: file that :func:`compress_scans` or :func:`compress_points` wrote.
         out: an empty folder, or one that the same command began: files that are there are not written again.
-        model: run by which it was compressed; points need none.
+        model: run by which it was compressed, ``pretrained`` if not given; points have none.
         kind: ``image`` for range images (H, W) in metres as ``.npy``, or name or ending of a format for points; if not
             given, range images of a model's file, and KITTI's ``.bin`` of a file of points.
         chosen: indices of the scans that are wanted; all if there is none.
     """
     archive = Archive(path)
+    if model and holds_points(archive):
+        raise UsageError(f"--model {model} for {path}, which holds points", "no model", "leave --model out")
     kind = kind or ("bin" if holds_points(archive) else IMAGE)
     form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     wrong = [index for index in chosen if not 0 <= index < len(archive)]
@@ -192,7 +194,7 @@ def decompress_scans(path: Path, out: Path, model: str, kind: str | None, chosen
     indices = list(dict.fromkeys(chosen)) or range(len(archive))
     if holds_points(archive):
         return decompress_points(archive, out, kind, indices)
-    codec = _codec_of(archive, model)
+    codec = _codec_of(archive, model or "pretrained")
     read = _Drives(archive, codec).read if codec.past_scans else lambda index: codec.decompress(archive.read(index))
     names = [archive.names[index] for index in indices]
     facts = {"source": path.name, "index_crc32": archive.index_crc32}

@@ -12,7 +12,6 @@ from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import PointScans, named_scans
-from lidargrit.generation.range_steps import check_step
 from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
 from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.point_codec import Cloud, PointCodec
@@ -30,7 +29,6 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
         step_mm: twice as much as any coordinate may change, in millimetres.
         config: number of scans, and what to do with unusable points and scans.
     """
-    check_step(step_mm)
     codec, scans = PointCodec(step_mm), named_scans(open_source(source, config.bad_points), config)
     if not isinstance(scans, PointScans):
         raise UsageError(f"range images in {source} with --points", "scans of points", "leave --points out")

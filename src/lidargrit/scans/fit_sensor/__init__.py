@@ -212,6 +212,8 @@ def _check_name(name: str) -> None:
         raise ConfigError(f"--name {name!r}", "a name in one line that is not blank", "choose another")
     if len(name) > NAME_AT_MOST:
         raise ConfigError(f"a name of {len(name)} letters", f"at most {NAME_AT_MOST}", "choose a shorter --name")
+    if name in discovery.names("sensors"):
+        raise ConfigError(f"the name {name}, which a sensor of the package has", "another one", "give one by --name")
 
 
 def _rows_by_order(scans: Sequence[Points], rings: Rings) -> tuple[FittedRows | None, Rings | None]:

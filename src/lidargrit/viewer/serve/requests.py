@@ -24,7 +24,6 @@ TASKS = {  # what a model makes of a scan → the words of its button on the pag
     "raydrop": "Drop rays of a clean scan",
     "label": "Name the class of each point",
 }
-_SECONDS_AT_MOST = 86_400
 
 
 @dataclass(frozen=True)
@@ -55,14 +54,6 @@ class Limits:
     kept: int = 24
     connections: int = 64
     idle_seconds: int = 15
-
-    def __post_init__(self) -> None:
-        if not 0 < self.seconds <= _SECONDS_AT_MOST:
-            raise ConfigError(
-                f"{self.seconds:g} seconds for one job",
-                f"more than 0, at most {_SECONDS_AT_MOST:,}",
-                "choose another number",
-            )
 
 
 class Example(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from waitress import wasyncore
 from waitress.server import create_server
 
-from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
+from lidargrit.core.errors import LidarGritError, OutputError
 from lidargrit.data.run_folder import PACKAGED, is_bundle, is_run
 from lidargrit.generation.generator import load
 from lidargrit.viewer.serve.application import ALL_ADDRESSES, LOOPBACK_NAMES, Application
@@ -22,7 +22,6 @@ from lidargrit.viewer.serve.jobs import JobQueue
 from lidargrit.viewer.serve.requests import Limits
 
 _THREADS = 4  # threads that answer requests: each takes milliseconds, because the worker process computes
-_PORT_AT_MOST = 65_535
 _RESPONSE_BYTES = 1 << 30  # more than any response has; all of them are in memory already
 
 
@@ -154,8 +153,6 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    if not 0 <= port <= _PORT_AT_MOST:
-        raise ConfigError(f"--port {port}", f"0 to {_PORT_AT_MOST}", "choose another one")
     wanted, cure = "an address or a name of this machine", "such as 127.0.0.1 for this machine only"
     try:
         host.encode("idna")
