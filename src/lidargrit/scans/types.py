@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
-from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.core.errors import OR_LEAVE_IT_OUT, ConfigError, ScanError
 from lidargrit.scans.columns import (
     BadPoints,
     ScanParts,
@@ -103,7 +103,7 @@ class Scan:
 
     def __post_init__(self) -> None:
         if len(self) == 0:
-            raise ScanError(f"no point in {self.source}", "a full revolution", "leave it out by --bad-scans skip")
+            raise ScanError(f"no point in {self.source}", "a full revolution", "take another scan" + OR_LEAVE_IT_OUT)
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())
