@@ -54,9 +54,10 @@ def parts_of_columns(
 ) -> ScanParts:
     """Return the parts of a scan in columns that are known by their names; others are left alone.
 
-    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. It is
-    left out, with a note, where it is none: of negative values or counts above 65535. Rings are counted from the top:
-    where the file's rise with elevation, they are turned round. A ring that all points have is none.
+    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. Among
+    fractions of 1, a few larger values are set to 1, with a note. Reflectance is left out, with a note, where it is
+    none: of negative values or counts above 65535. Rings are counted from the top: where the file's rise with
+    elevation, they are turned round. A ring that all points have is none.
 
     Args:
         columns: values of every point by their names.

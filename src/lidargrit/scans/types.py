@@ -41,7 +41,7 @@ class Scan:
         label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
         source: file or other origin of the scan, for messages.
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
-            largest value decided; 0 elsewhere.
+            values decided; 0 elsewhere.
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
         point_time_s: time of every point in seconds, kept in 64 bits: on the clock of ``time_s``, or since the scan
             began; None if it is not known.
