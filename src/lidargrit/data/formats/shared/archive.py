@@ -123,13 +123,13 @@ def _points_name(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo
 
 def _are_rings(columns: np.ndarray) -> bool:
     """Return whether a fourth column without a name numbers lasers: few whole numbers, each at one elevation."""
-    x, y, z, number = columns
+    x, y, z, number = columns.astype(np.float64)  # in 32 bits, squares of huge numbers overflow
     if len(number) < _POINTS_FOR_RINGS or not np.isfinite(columns).all():
         return False
     values, of_point = np.unique(number, return_inverse=True)
     if not (4 <= len(values) <= _RINGS_AT_MOST and values[0] >= 0 and values[-1] < _RINGS_AT_MOST):
         return False
-    elevation = np.arctan2(z.astype(np.float64), np.hypot(x, y))
+    elevation = np.arctan2(z, np.hypot(x, y))
     mean = np.bincount(of_point, elevation) / np.bincount(of_point)
     return bool((values % 1 == 0).all()) and float(
         np.square(elevation - mean[of_point]).mean()
