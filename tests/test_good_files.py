@@ -202,6 +202,9 @@ def test_one_array_of_another_name_is_a_scan_only_if_it_has_rows_of_points(tmp_p
         assert not is_recognised(tmp_path / "a.npz"), name
         with pytest.raises(ScanError, match=f"holds the arrays '{name}'.*call the array of points 'points'"):
             read_scan(tmp_path / "a.npz")
+    np.savez(tmp_path / "none.npz")
+    with pytest.raises(ScanError, match="which holds no array; wanted"):
+        read_scan(tmp_path / "none.npz")
     np.savez(tmp_path / "a.npz", K=np.tile([[3.0, 4.0, 5.0]], (16, 1)))
     assert is_recognised(tmp_path / "a.npz")
     assert len(read_scan(tmp_path / "a.npz")) == 16

@@ -47,7 +47,7 @@ def columns_of_archive(archive: zipfile.ZipFile, path: Path, wanted: str) -> tup
         if _IMAGE in members:
             got, cure = "a range image from a folder of samples", f"name the whole folder: {path.absolute().parent}"
         else:
-            got = f"which holds the arrays {', '.join(map(ascii, there[:8]))[:120]}"
+            got = f"which holds {'the arrays ' + ', '.join(map(ascii, there[:8]))[:120] if there else 'no array'}"
             cure = "call the array of points 'points'"
         raise ScanError(f"{path}, {got}", wanted, cure)
     if points_name:
