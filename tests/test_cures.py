@@ -145,6 +145,24 @@ def test_every_option_that_a_message_names_is_taken(verb, scans, tmp_path, capsy
     assert refused, "no message at all"
 
 
+@pytest.mark.parametrize("verb", ["fit-sensor", "inspect", "prepare", "view"])
+def test_a_scan_without_points_is_not_left_out_by_the_option_that_was_given(verb, scans, tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    np.save(tmp_path / "in" / "0.npy", np.zeros((0, 4), np.float32))
+    words, skip = words_of(verb, tmp_path / "in", tmp_path), ["--bad-scans", "skip"]
+    assert main(words) == 2
+    assert capsys.readouterr().err.count(" ".join(skip)) == 1
+    assert main([*words, *skip]) == 2
+    told = capsys.readouterr().err
+    assert "--bad-scans" not in told
+    assert re.search("; take another scan$|no usable scan", told, re.MULTILINE)
+    (tmp_path / "in" / "1.bin").write_bytes(points("vlp16").tobytes())
+    assert main([*words_of(verb, tmp_path / "in", tmp_path / "two"), *skip]) == 0
+    output = "".join(capsys.readouterr())
+    assert "left out: got no point in " in output
+    assert "--bad-scans" not in output
+
+
 @pytest.mark.parametrize("verb", ["complete", "compress", "likelihood", "raydrop", "segment"])
 def test_a_run_refuses_another_sensor_and_other_columns_with_a_cure_that_works(verb, scans, tmp_path, capsys):
     words = words_of(verb, scans / "few_rings", tmp_path)

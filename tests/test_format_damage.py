@@ -257,6 +257,11 @@ def test_sweeps_that_would_unpack_to_far_more_where_no_size_is_counted(refused, 
     assert "a column with a dictionary, or packed as in 2020" in refused(data, "a.feather")
 
 
-def test_pickles_are_not_loaded(refused, tmp_path):
-    np.save(tmp_path / "o.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    assert "dtype('O')" in refused((tmp_path / "o.npy").read_bytes(), "a.npy")
+@pytest.mark.parametrize("kind", [object, complex, "M8[s]", "U5"])
+def test_arrays_of_other_than_numbers_are_refused_as_what_they_are(refused, tmp_path, kind):  # no pickle is loaded
+    for name in ("o.npy", "o.npz"):
+        values = np.ones((9, 4)).astype(int).astype(kind)
+        np.savez(tmp_path / name, points=values) if name == "o.npz" else np.save(tmp_path / name, values)
+        told = refused((tmp_path / name).read_bytes(), f"a.{name[-3:]}")
+        assert f"which holds an array of {values.dtype!r}" in told
+        assert told.endswith("save its arrays as numbers, with a row for each point")

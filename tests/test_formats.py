@@ -256,6 +256,7 @@ def test_reflectance_beyond_all_scales_is_refused(tmp_path, values):
     [
         ({"ring": [0.5, 1]}, "a ring that is not whole or out of bounds"),
         ({"ring": [-1, 1]}, "a ring that is not whole or out of bounds"),
+        ({"ring": [-5, -5], "points": np.eye(3)[1:]}, "a ring that is not whole or out of bounds"),
         ({"ring": [np.nan, 1]}, "a ring that is not whole or out of bounds"),
         ({"label": [0, 2**32]}, "a label that is not whole or out of bounds"),
         ({"ring": [0, 1, 2]}, r"2 points, but ring of shape \(3,\)"),

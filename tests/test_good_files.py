@@ -111,6 +111,23 @@ def test_empty_cells_of_a_table_are_no_numbers(tmp_path, separator):
     check(tmp_path / "b.csv", KEPT, "drop")
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t", " "])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-be"])
+def test_tables_of_spreadsheets_are_read(tmp_path, separator, encoding):
+    quoted = [separator.join(f'"{word}"' for word in row) for row in [COLUMNS, *ROWS.tolist()]]
+    mark = "\ufeff" if encoding == "utf-16-be" else ""  # which Python writes before the others
+    (tmp_path / "a.csv").write_bytes((mark + "\r\n".join(quoted)).encode(encoding))
+    check(tmp_path / "a.csv")
+
+
+def test_commas_within_quotation_marks_are_no_decimal_points(tmp_path):
+    (tmp_path / "a.csv").write_text('x,y,z,intensity\n"1,5","2","3"\n')
+    with pytest.raises(ScanError, match="with a decimal point"):
+        read_scan(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text('x;y;z;note\n"1.5";2;"";"a"\n2;3;4;b\n"1.5";2;3;""\n')
+    assert len(read_scan(tmp_path / "a.csv", bad_points="drop")) == 2
+
+
 def with_lists(lengths, order):
     out = BytesIO()
     for row, length in zip(ROWS, lengths, strict=True):
@@ -185,6 +202,9 @@ def test_one_array_of_another_name_is_a_scan_only_if_it_has_rows_of_points(tmp_p
         assert not is_recognised(tmp_path / "a.npz"), name
         with pytest.raises(ScanError, match=f"holds the arrays '{name}'.*call the array of points 'points'"):
             read_scan(tmp_path / "a.npz")
+    np.savez(tmp_path / "none.npz")
+    with pytest.raises(ScanError, match="which holds no array; wanted"):
+        read_scan(tmp_path / "none.npz")
     np.savez(tmp_path / "a.npz", K=np.tile([[3.0, 4.0, 5.0]], (16, 1)))
     assert is_recognised(tmp_path / "a.npz")
     assert len(read_scan(tmp_path / "a.npz")) == 16

@@ -205,7 +205,7 @@ def test_an_empty_cloud_is_left_out_by_the_option_that_its_message_names(has_fie
     path = str(mcap(tmp_path / "a.mcap", [("/top", empty)] + [("/top", message(corner(at))) for at in range(3)]))
     for words in (["inspect", path, "--sensor", "vlp16"], ["fit-sensor", path, "-o", str(tmp_path / "f.json")]):
         assert main(words) == 2
-        assert "leave it out by --bad-scans skip" in capsys.readouterr().err
+        assert "take another scan, or of several leave it out by --bad-scans skip" in capsys.readouterr().err
         assert main([*words, "--bad-scans", "skip"]) == 0
         output = capsys.readouterr().out
         assert f"note: left out: got no point in {path}#0" in output

@@ -72,6 +72,21 @@ def test_what_is_no_reflectance_is_left_out_with_a_word(tmp_path, suffix, values
     assert why in scan.notes[0]
 
 
+@pytest.mark.parametrize(
+    ("kind", "count", "highest", "scale"),
+    [("fractions", 1, 2, 1), ("fractions", 1, 200_000, 1), ("fractions", 200, 2, 255), ("zeros and ones", 1, 2, 255)],
+)
+def test_a_few_values_above_fractions_of_1_leave_the_others_as_they_are(tmp_path, kind, count, highest, scale):
+    values = INTENSITY / 255 * 0.9 if kind == "fractions" else (INTENSITY > 90).astype(np.float32)
+    values[:count] = highest
+    scan = read_scan(written(tmp_path, ".csv", {"intensity": values}))
+    assert scan.reflectance is not None
+    assert scan.full_scale == scale
+    assert torch.allclose(scan.reflectance, torch.from_numpy(values / scale).clamp(max=1), rtol=1e-5)
+    told = f"1 of {len(values):,} values of intensity set to 1, of up to {highest:g}: most are fractions of 1"
+    assert scan.notes == ((told,) if scale == 1 else ())
+
+
 def test_a_little_below_zero_is_zero(tmp_path):
     values = (INTENSITY / 255 - INTENSITY.min() / 255 - 0.0078).astype(np.float32)
     scan = read_scan(written(tmp_path, ".pcd", {"intensity": values}))

@@ -208,6 +208,9 @@ def test_anomaly_is_what_exceeds_the_expected_bits(tmp_path, capsys):
     assert (tmp_path / "anomaly.png").stat().st_size > 10_000
     assert main([*words, "-o", str(tmp_path / "anomaly.html")]) == 0
     assert '"anomaly": "' in (tmp_path / "anomaly.html").read_text()
+    capsys.readouterr()
+    assert main([*words, "-o", str(tmp_path / "other.png"), "--sensor", "vlp16"]) == 2
+    assert "first: lidargrit rescan SCANS SEEN --sensor vlp16 --to " in capsys.readouterr().err
 
 
 def test_maskgit_counts_every_token_alike():

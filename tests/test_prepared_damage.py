@@ -167,6 +167,14 @@ def test_a_plan_or_a_list_of_scans_that_is_none_is_refused(folder, name, content
         PreparedImages(str(folder))
 
 
+@pytest.mark.parametrize(("more", "told"), [({}, "lacks 'bad_points', 'bad_scans', 'digest'"), ({"a": 1}, "has 'a'")])
+def test_what_a_plan_lacks_or_has_besides_is_told(folder, more, told):
+    plan = json.loads((folder / "plan.json").read_text()) if more else {}
+    (folder / "plan.json").write_text(json.dumps({**plan, **more}))
+    with pytest.raises(DataError, match=rf"plan.json, which is no plan \(it {told}\); wanted"):
+        PreparedImages(str(folder))
+
+
 @pytest.mark.parametrize("step_m", [0.0, 0.1, -0.002, 1e308])
 def test_another_step_of_range_than_the_sensors_is_refused(folder, step_m):
     plan = json.loads((folder / "plan.json").read_text())

@@ -147,6 +147,21 @@ def test_the_picture_is_drawn_even_of_nothing(tmp_path, scale):
     assert (tmp_path / "it.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.parametrize("points", ["one far beyond", "one far beyond, with rings", "all straight above"])
+def test_strange_points_are_inspected_without_a_warning_of_a_library(tmp_path, points):  # which the tests refuse
+    scan = simulate(seed=1, sensor=load_sensor("vlp16").with_columns(90))
+    rows = np.c_[scan.points_xyz_m.numpy(), np.zeros(len(scan), np.float32)]
+    if points == "all straight above":
+        rows[:, :3] = [0, 0, 5]
+    else:
+        rows[7, :2] = 3e38
+    if "rings" in points:
+        assert scan.ring is not None
+        rows[:, 3] = scan.ring
+    np.save(tmp_path / "a.npy", rows)
+    assert main(["inspect", str(tmp_path / "a.npy"), "-o", str(tmp_path / "a.png")]) == 0
+
+
 def test_the_verb_prints_a_table_and_writes_what_it_is_told_to(tmp_path, capsys):
     command = ["inspect", "simulated:1", "--projection", "spherical", "--set", "data.columns=512"]
     files = ["-o", str(tmp_path / "it.png"), "--json", str(tmp_path / "it.json")]

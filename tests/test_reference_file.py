@@ -142,6 +142,7 @@ def test_damaged_and_altered_files_are_refused_in_one_line(path, tmp_path, capsy
     data = path.read_bytes()
     (tmp_path / "short.lgref").write_bytes(data[: len(data) // 2])
     (tmp_path / "empty.lgref").write_bytes(b"")
+    (tmp_path / "begun.lgref").write_bytes(b"PK")
 
     def other_count(arrays):
         about = json.loads(arrays["about"].tobytes())
@@ -156,7 +157,8 @@ def test_damaged_and_altered_files_are_refused_in_one_line(path, tmp_path, capsy
     rewritten(path, tmp_path / "numbers.lgref", other_numbers)
     lines = {
         "short": "which cannot be read",
-        "empty": "which cannot be read",
+        "empty": "which cannot be read (an empty file)",
+        "begun": "which cannot be read (2 bytes, too few for an archive)",
         "missing": "which is not there",
         "count": "which was altered after it was written",
         "numbers": "in which total of bev_jsd was altered",

@@ -234,11 +234,11 @@ def test_a_condition_of_another_size_than_its_sensor_is_refused():
         Observed(range_m, known, known, known, K360.with_columns(64))
 
 
-@pytest.mark.parametrize(("usual", "bright", "told"), [(0.6, 3.5, "by 1 in 5 scans"), (250, 300, "by 255 in 5 scans")])
+@pytest.mark.parametrize(("usual", "bright", "told"), [(1, 3, "by 1 in 5 scans"), (250, 300, "by 255 in 5 scans")])
 def test_a_bright_point_that_makes_its_scan_darker_is_told(tmp_path, usual, bright, told, heard):
     scan = simulate(0, VLP16)
     for number in range(6):
-        intensity = torch.linspace(0, usual, len(scan)).numpy()
+        intensity = torch.linspace(0, usual, len(scan)).numpy().round()
         intensity[0] = bright if number == 5 else usual
         np.savez(tmp_path / f"{number}.npz", points=scan.points_xyz_m.numpy(), intensity=intensity)
     config = DataConfig(sensor="vlp16", columns=180, workers=1)

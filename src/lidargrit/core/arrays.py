@@ -19,6 +19,10 @@ _END_BYTES, _END_BYTES_64 = 22, 20  # of the records that end an archive; the se
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
+class NoNumbersError(ValueError):
+    """An array is whole, but holds no numbers, or has more axes than any of ours."""
+
+
 def parse_header(file: BytesIO) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Return the shape of an .npy file's array, whether it lies column by column, and the type of its numbers.
 
@@ -46,7 +50,8 @@ def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
     """Return the array in the bytes of an .npy file; it shares their memory.
 
     Raises:
-        ValueError: a damaged header, other than numbers or truth values, or fewer bytes than the shape needs.
+        NoNumbersError: other than numbers or truth values.
+        ValueError: a damaged header, or fewer bytes than the shape needs.
     """
     file = BytesIO(data)
     shape, by_column, dtype = parse_header(file)
@@ -54,8 +59,11 @@ def parse_array(data: bytes, may_have_fields: bool = False) -> np.ndarray:
     plain = all(type(size) is int and size >= 0 for size in shape)
     fields = [of_field for of_field, *_ in dtype.fields.values()] if may_have_fields and dtype.fields else [dtype]
     kinds = {of_field.base.kind for of_field in fields}
-    if not kinds <= {*"fiub"} or not dtype.itemsize or not plain or len(shape) > DIMENSIONS_AT_MOST:
-        raise ValueError(f"an array of {ascii(dtype)[:40]} and shape {str(shape)[:60]}")
+    what = f"an array of {ascii(dtype)[:40]} and shape {str(shape)[:60]}"
+    if not dtype.itemsize or not plain:
+        raise ValueError(what)
+    if not kinds <= {*"fiub"} or len(shape) > DIMENSIONS_AT_MOST:
+        raise NoNumbersError(what)
     there, needed = len(data) - file.tell(), math.prod(shape) * dtype.itemsize
     if there < needed:
         raise ValueError(f"{there:,} bytes of an array that needs {needed:,}")
@@ -74,6 +82,8 @@ def open_archive(file: BytesIO | BufferedReader) -> zipfile.ZipFile:
     """
     try:
         size = file.seek(0, 2)
+        if size < _END_BYTES:
+            raise ValueError(f"{size} bytes, too few for an archive" if size else "an empty file")
         file.seek(max(0, size - _END_BYTES - _END_BYTES_64))
         end = file.read()
         directory_bytes = struct.unpack("<4s8xI6x", end[-_END_BYTES:])[1]

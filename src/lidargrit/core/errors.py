@@ -16,6 +16,7 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 
+OR_LEAVE_IT_OUT = ", or of several leave it out by --bad-scans skip"
 _LETTERS_AT_MOST = 600  # of each part of a message: a long path in full, or a few
 _ROOT, _LETTERS_OF_A_PATH = r"(?:~|[A-Za-z]:)?[/\\]", r"[^\s,;:)'\"<>]*"
 _ABSOLUTE_PATH = re.compile(rf"(?<![\w.…]){_ROOT}{_LETTERS_OF_A_PATH}")
@@ -43,6 +44,10 @@ class UsageError(LidarGritError):
 
 class ScanError(LidarGritError):
     """A scan file, or the points in it, cannot be used."""
+
+    def as_left_out(self) -> "ScanError":
+        """Return the error without the cure to leave the scan out, for where scans are left out anyway."""
+        return type(self)(self.got, self.wanted, self.cure.removesuffix(OR_LEAVE_IT_OUT))
 
 
 class DataError(LidarGritError):

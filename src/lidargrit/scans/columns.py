@@ -54,9 +54,10 @@ def parts_of_columns(
 ) -> ScanParts:
     """Return the parts of a scan in columns that are known by their names; others are left alone.
 
-    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. It is
-    left out, with a note, where it is none: of negative values or counts above 65535. Rings are counted from the top:
-    where the file's rise with elevation, they are turned round. A ring that all points have is none.
+    Reflectance is divided by 1, 255 or 65535: the smallest that no value exceeds, and 255 for columns of 8 bits. Among
+    fractions of 1, a few larger values are set to 1, with a note. Reflectance is left out, with a note, where it is
+    none: of negative values or counts above 65535. Rings are counted from the top: where the file's rise with
+    elevation, they are turned round. A ring that all points have is none.
 
     Args:
         columns: values of every point by their names.
@@ -73,8 +74,8 @@ def parts_of_columns(
     _refuse_lost_digits([named[axis] for axis in "xyz"], points_xyz_m, source)
     ring, label = (_first(named, names) for names in (_RING, _LABEL))
     good = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    ring = None if ring is None else _whole(ring, good, _RING_AT_MOST, "ring", source)
     if ring is not None and _tells_rows(ring, points_xyz_m, good):
-        ring = _whole(ring, good, _RING_AT_MOST, "ring", source)
         _refuse_counts_from_1(ring[good], source)
         ring = _from_the_top(ring, points_xyz_m, good)
     else:
@@ -220,9 +221,9 @@ def _whole(values: np.ndarray, good: Tensor, at_most: int, what: str, source: st
     return torch.from_numpy(values.astype(np.int64))
 
 
-def _tells_rows(ring: np.ndarray, points_xyz_m: Tensor, good: Tensor) -> bool:
+def _tells_rows(ring: Tensor, points_xyz_m: Tensor, good: Tensor) -> bool:
     """Return whether a column of rings tells points apart: some drivers write 0 for all."""
-    if not good.any() or (ring != ring.flat[0]).any():
+    if not good.any() or (ring[good] != ring[good][0]).any():
         return True
     low, high = _elevation_rad(points_xyz_m[good]).aminmax()
     return float(high - low) < _ONE_RING_AT_MOST_RAD

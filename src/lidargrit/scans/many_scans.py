@@ -43,8 +43,8 @@ def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -
         try:
             scans.append(dataset.scan(index))
         except ScanError as wrong:
-            error = wrong
-            skipped.append(f"left out: {wrong}")
+            error = wrong.as_left_out()
+            skipped.append(f"left out: {error}")
     if error and not scans:
         raise error
     if len(skipped) > _TOLD_AT_MOST:

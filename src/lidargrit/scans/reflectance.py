@@ -12,6 +12,7 @@ from torch import Tensor
 # is not (Ouster), but drivers write it as 0 where they do not compute it. Open3D's tensor clouds say "intensities".
 REFLECTANCE_NAMES = ("reflectance", "reflectivity", "intensity", "remission", "intensities", "i")
 _FULL_SCALES = (1, 255, 65_535)
+_FRACTIONS_TELL = 10  # so many between 0 and 1 to each value above: 0 to 1 with a few too high, and no dark 0 to 255
 _ABOUT_1 = 1.05  # of reflectance from 0 to 1 that a calibration took a little beyond
 _A_LITTLE_BELOW_0 = 0.05  # of the full scale, which a calibration does as well; decibels go far below
 
@@ -21,8 +22,8 @@ class Reflectance(NamedTuple):
 
     Args:
         values: reflectance in [0, 1] (n,), unless the file's values are no numbers; None if there is none.
-        full_scale: number that it was divided by if the largest value told that; 0 otherwise.
-        notes: sentences on columns that were left out.
+        full_scale: number that it was divided by if its values told that; 0 otherwise.
+        notes: sentences on columns that were left out, and on values that were too high.
     """
 
     values: Tensor | None
@@ -53,7 +54,9 @@ def choose_reflectance(
     chosen = next((name for name, varies in usable if varies), usable[0][0] if usable else "")
     if not chosen:
         return Reflectance(None, 0, tuple(notes))
-    return Reflectance(*_to_unit(named[chosen]), () if dict(usable)[chosen] else tuple(notes))
+    known = _known(named[chosen], good)
+    notes = [*([] if dict(usable)[chosen] else notes), *_above_1(chosen, known)]
+    return Reflectance(*_to_unit(named[chosen], known), tuple(notes))
 
 
 def floats(values: np.ndarray) -> Tensor:
@@ -72,28 +75,38 @@ def _why_none(known: np.ndarray) -> str:
     """Return why values are no reflectance; "" if they are."""
     if not len(known):
         return ""
-    low, high = float(known.min()), float(known.max())
-    if low < -_A_LITTLE_BELOW_0 * (_full_scale(high) or 1):
+    full_scale = _full_scale(known)
+    if float(known.min()) < -_A_LITTLE_BELOW_0 * (full_scale or 1):
         return "negative values, such as decibels, are no reflectance"
-    return f"counts above {_FULL_SCALES[-1]:,} have no full scale that we know" if high > _FULL_SCALES[-1] else ""
+    return "" if full_scale else f"counts above {_FULL_SCALES[-1]:,} have no full scale that we know"
 
 
-def _to_unit(reflectance: np.ndarray) -> tuple[Tensor, int]:
-    """Return reflectance from 0 to 1, and its full scale if the largest value told that; 0 otherwise."""
+def _above_1(name: str, known: np.ndarray) -> tuple[str, ...]:
+    """Return a note on values above 1 among reflectance from 0 to 1."""
+    above = int(np.count_nonzero(known > _ABOUT_1))
+    if not above or _full_scale(known) != 1:
+        return ()
+    return (
+        f"{above:,} of {len(known):,} values of {name} set to 1, of up to {known.max():g}: most are fractions of 1",
+    )
+
+
+def _to_unit(reflectance: np.ndarray, known: np.ndarray) -> tuple[Tensor, int]:
+    """Return reflectance from 0 to 1, and its full scale if the known values told that; 0 otherwise."""
     values = floats(reflectance)
     if reflectance.dtype == np.uint8:
         return values / 255, 0
-    highest = float(values.nan_to_num(0.0, torch.inf, 0.0).max()) if len(values) else 0.0
-    full_scale = _full_scale(highest) or 1
-    values = values / full_scale
+    full_scale = _full_scale(known)
+    values = values / (full_scale or 1)
     values = torch.where((values < 0) & (values >= -_A_LITTLE_BELOW_0), 0, values)
-    if highest <= 0:  # of any scale
-        return values, 0
-    return (values.clamp(max=1) if highest <= _ABOUT_1 else values), full_scale
+    if full_scale:
+        values = torch.where(values.isinf(), values, values.clamp(max=1))
+    return values, full_scale if (known > 0).any() else 0  # 0 is of any scale
 
 
-def _full_scale(highest: float) -> int:
-    """Return the number that values up to the highest are of; 0 if that is too high for any."""
-    if highest <= _ABOUT_1:
+def _full_scale(known: np.ndarray) -> int:
+    """Return the number that known values are of; 0 if they are too high for any."""
+    above, fractions = np.count_nonzero(known > _ABOUT_1), np.count_nonzero((known > 0) & (known < 1))
+    if above * _FRACTIONS_TELL <= fractions:
         return 1
-    return next((scale for scale in _FULL_SCALES if highest <= scale), 0)
+    return next((scale for scale in _FULL_SCALES if known.max() <= scale), 0)

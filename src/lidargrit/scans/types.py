@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
-from lidargrit.core.errors import ConfigError, ScanError
+from lidargrit.core.errors import OR_LEAVE_IT_OUT, ConfigError, ScanError
 from lidargrit.scans.columns import (
     BadPoints,
     ScanParts,
@@ -41,7 +41,7 @@ class Scan:
         label: class of every point by SemanticKITTI's numbers, with its instance in the upper 16 of 32 bits.
         source: file or other origin of the scan, for messages.
         full_scale: number that reflectance was divided by, 1, 255 or 65,535, where the file does not tell and the
-            largest value decided; 0 elsewhere.
+            values decided; 0 elsewhere.
         notes: sentences on what was taken or left out when the file was read, for those who look at the scan.
         point_time_s: time of every point in seconds, kept in 64 bits: on the clock of ``time_s``, or since the scan
             began; None if it is not known.
@@ -103,7 +103,7 @@ class Scan:
 
     def __post_init__(self) -> None:
         if len(self) == 0:
-            raise ScanError(f"no point in {self.source}", "a full revolution", "leave it out by --bad-scans skip")
+            raise ScanError(f"no point in {self.source}", "a full revolution", "take another scan" + OR_LEAVE_IT_OUT)
         object.__setattr__(self, "points_xyz_m", self.points_xyz_m.float())  # those of NumPy often have 64 bits
         if self.reflectance is not None:
             object.__setattr__(self, "reflectance", self.reflectance.float())

@@ -70,7 +70,7 @@ def _plot_collisions(figure: Figure, axes: Axes, inspection: Inspection) -> None
 
 def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
     """Plot every point from above and from the side, the lost ones in the colour of their fate."""
-    x, y, z = inspection.scan.points_xyz_m.numpy().T
+    x, y, z = inspection.scan.points_xyz_m.double().numpy().T  # in 32 bits, squares of huge numbers overflow
     away = np.hypot(x, y)
     names = list(FATES)
     # Those left out with their columns first, then the kept ones, so that they hide no lost one.
@@ -82,7 +82,8 @@ def _plot_lost(above: Axes, side: Axes, inspection: Inspection) -> None:
             above.scatter(y[shown], x[shown], s=_DOT, **faint)
             side.scatter(away[shown], z[shown], s=_DOT, **faint)
             side.scatter([], [], color=_COLOURS[name], s=20, label=f"{FATES[name]}: {len(those)}")
-    half, (low, high) = float(np.quantile(away, 0.99)), np.quantile(z, (0.001, 0.999))
+    half = float(np.quantile(away, 0.99)) or 1.0  # of points straight above, an axis without a length is no picture
+    low, high = np.quantile(z, (0.001, 0.999))
     above.plot(0, 0, marker="+", color="black")
     above.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", xlabel="left [m]", ylabel="forward [m]")
     above.set_title("from above", loc="left")

@@ -163,7 +163,7 @@ def _of_scans(
         except ScanError as error:
             if config.bad_scans == "refuse":
                 raise
-            reporting.message(f"left out: {error}")
+            reporting.message(f"left out: {error.as_left_out()}")
             continue
         shown = index_map(scan, sensor, variant=config.projection_variant)[:, :: sensor.column_stride]
         has_pixel = torch.zeros(len(scan), dtype=torch.bool)

@@ -8,6 +8,7 @@ from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import PAGE_SCANS_AT_MOST
 from lidargrit.data.prepared.config import ScanSettings
+from lidargrit.data.sources.scan_sensor import other_sensor
 from lidargrit.generation.generator import load
 from lidargrit.viewer.interactive import write_page
 from lidargrit.viewer.pictures import SCANS_AT_MOST, plot_comparison
@@ -39,6 +40,10 @@ def view(
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:
+        typed = settings.sensor if settings else ""
+        for scans in sets:
+            if not scans.images.sensor.same_rays(model.sensor):
+                raise other_sensor(scans.images.sensor, model.sensor, anomaly_by, typed)
         sets = [replace(scans, anomaly=model.bits(scans.images, expected=True).anomaly().cpu()) for scans in sets]
     for scans in sets:
         _tell_hidden(scans, is_page)

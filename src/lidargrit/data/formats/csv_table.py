@@ -1,5 +1,6 @@
 """Tables of text (.csv) with a header that names x, y and z ⇄ :class:`Scan`."""
 
+import codecs
 import re
 import warnings
 from collections.abc import Mapping
@@ -23,14 +24,15 @@ from lidargrit.scans.types import Scan
 
 _FORMAT = "lines of numbers below a line that names the columns, x, y and z among them"
 _HEADER_BYTES = 4096
+_MARKS_OF_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SEPARATORS = (",", ";", "\t", " ")
 
 
 class CsvTable(ColumnFormat):
     """Text with a first line of names, such as ``x,y,z,intensity``; separated by commas, semicolons, tabs or blanks.
 
-    Names may stand in quotation marks and in capitals, and "#" or "//" before the first of them. Numbers have a decimal
-    point. Columns of other names are left alone.
+    Names and numbers may stand in quotation marks, names in capitals, and "#" or "//" before the first of them. Numbers
+    have a decimal point. Columns of other names are left alone.
     """
 
     title = "table of text with a header (.csv)"
@@ -39,12 +41,12 @@ class CsvTable(ColumnFormat):
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether the first line names x, y and z."""
-        return {"x", "y", "z"} <= {name.lower() for name in _names(first_bytes(path, _HEADER_BYTES))[0]}
+        return {"x", "y", "z"} <= {name.lower() for name in _names(_utf_8(first_bytes(path, _HEADER_BYTES)))[0]}
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
-        data = read_bytes(path, BYTES_AT_MOST, _FORMAT)
+        data = _utf_8(read_bytes(path, BYTES_AT_MOST, _FORMAT))
         names, separator = _names(data[:_HEADER_BYTES])
         wanted: dict[str, int] = {}
         for number, name in enumerate(names):
@@ -58,7 +60,7 @@ class CsvTable(ColumnFormat):
         body = data[data.find(b"\n") + 1 :] if b"\n" in data else b""
         check_lines(body, path, _FORMAT)
         _check_fields(body, len(names), separator, path)
-        body = _with_nan(plain_text(body), len(names), separator)
+        body = _with_nan(_unquoted(plain_text(body), separator), len(names), separator)
         try:
             with warnings.catch_warnings(action="ignore"):  # of a table without lines: said below
                 table = np.loadtxt(
@@ -85,6 +87,16 @@ class CsvTable(ColumnFormat):
         table = np.column_stack([of.astype(np.float64) for of in columns.values()])
         with atomic_path(path) as temporary:
             np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="ascii")
+
+
+def _utf_8(data: bytes) -> bytes:
+    """Return a table that Windows saved as UTF-16 ("Unicode") in UTF-8, and others as they are."""
+    return data if data[:2] not in _MARKS_OF_UTF_16 else data.decode("utf-16", "replace").encode()
+
+
+def _unquoted(body: bytes, separator: str) -> bytes:
+    """Return lines without the quotation marks around a whole field, which spreadsheets write."""
+    return re.sub(rb'"([^"\n' + separator.encode() + rb']*)"', rb"\1", body) if b'"' in body else body
 
 
 def _with_nan(body: bytes, names: int, separator: str) -> bytes:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, open_archive, parse_array, parse_header
+from lidargrit.core.arrays import HEADER_BYTES_AT_MOST, NoNumbersError, open_archive, parse_array, parse_header
 from lidargrit.core.errors import ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.data.formats import BadPoints, damaged, first_bytes, open_file, read_bytes
@@ -56,7 +56,7 @@ class NumpyArray(ColumnFormat):
             try:
                 rows = parse_array(data, may_have_fields=True)
             except ValueError as error:
-                raise damaged(path, _FORMAT, error) from None
+                raise _unreadable(path, error) from None
             columns, names = columns_of_rows(rows, path, _FORMAT), list(rows.dtype.names or ())
             if (marks := read_marks(path, len(next(iter(columns.values()), ())))) is not None:
                 columns["filled"] = marks.numpy().astype(np.uint8)
@@ -105,4 +105,12 @@ def _archive(file: BytesIO | BufferedReader, path: Path) -> Iterator[zipfile.Zip
     except ScanError:
         raise
     except ValueError as error:
-        raise damaged(path, _FORMAT, error) from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: ValueError) -> ScanError:
+    if isinstance(error, NoNumbersError):
+        return ScanError(
+            f"{path}, which holds {error}", _FORMAT, "save its arrays as numbers, with a row for each point"
+        )
+    return damaged(path, _FORMAT, error)

@@ -41,6 +41,9 @@ class PreparedSpec:
     @classmethod
     def from_json(cls, entries: dict[str, Any]) -> "PreparedSpec":
         """Return the plan that a file holds, or raise TypeError; the sensor checks itself."""
+        names = {one.name for one in fields(cls)}
+        if wrong := sorted(names - entries.keys()) or sorted(entries.keys() - names):
+            raise TypeError(f"it {'has' if wrong[0] in entries else 'lacks'} {', '.join(map(ascii, wrong[:3]))}")
         spec = cls(**entries)
         for one in fields(cls):
             kind = {int: int, float: (int, float), str: str}.get(one.type, dict)

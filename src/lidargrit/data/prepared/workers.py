@@ -116,10 +116,11 @@ def make_shard(
             scan = dataset.scan(wanted[index])
             image = project(scan, sensor, variant=variant_named(spec.variant))
         except ScanError as error:
+            wrong = error.as_left_out()
             if spec.bad_scans == "refuse":
                 leave_out = "leave such scans out by --bad-scans skip"
-                raise ScanError(error.got, error.wanted, f"{error.cure}, or {leave_out}") from None
-            writer.leave_out(index, str(error))
+                raise ScanError(wrong.got, wrong.wanted, f"{wrong.cure}, or {leave_out}") from None
+            writer.leave_out(index, str(wrong))
         else:
             writer.add(index, image, scan.full_scale)
         advance(1)

@@ -241,7 +241,7 @@ def elevation_span_deg(scan: Scan) -> tuple[float, float]:
 
 def elevations_deg(points_xyz_m: Tensor) -> np.ndarray:
     """Return the elevation of points (n, 3) in degrees, (n,)."""
-    x, y, z = points_xyz_m.numpy().T
+    x, y, z = points_xyz_m.double().numpy().T  # in 32 bits, squares of huge numbers overflow
     return np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
@@ -331,7 +331,7 @@ def _rings_in_order(scan: Scan) -> Int[np.ndarray, "n"] | None:
 
 def _is_ring_by_ring(scan: Scan, ring: Int[np.ndarray, "n"]) -> bool:
     """Return whether rings that were found in the order of the points each keep to one elevation."""
-    elevation_deg = elevations_deg(scan.points_xyz_m).astype(np.float64)
+    elevation_deg = elevations_deg(scan.points_xyz_m)
     points = np.maximum(np.bincount(ring), 1)
     mean_deg = np.bincount(ring, elevation_deg) / points
     within = np.square(elevation_deg - mean_deg[ring]).mean()

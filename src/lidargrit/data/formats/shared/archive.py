@@ -47,7 +47,7 @@ def columns_of_archive(archive: zipfile.ZipFile, path: Path, wanted: str) -> tup
         if _IMAGE in members:
             got, cure = "a range image from a folder of samples", f"name the whole folder: {path.absolute().parent}"
         else:
-            got = f"which holds the arrays {', '.join(map(ascii, there[:8]))[:120]}"
+            got = f"which holds {'the arrays ' + ', '.join(map(ascii, there[:8]))[:120] if there else 'no array'}"
             cure = "call the array of points 'points'"
         raise ScanError(f"{path}, {got}", wanted, cure)
     if points_name:
@@ -123,13 +123,13 @@ def _points_name(archive: zipfile.ZipFile, members: Mapping[str, zipfile.ZipInfo
 
 def _are_rings(columns: np.ndarray) -> bool:
     """Return whether a fourth column without a name numbers lasers: few whole numbers, each at one elevation."""
-    x, y, z, number = columns
+    x, y, z, number = columns.astype(np.float64)  # in 32 bits, squares of huge numbers overflow
     if len(number) < _POINTS_FOR_RINGS or not np.isfinite(columns).all():
         return False
     values, of_point = np.unique(number, return_inverse=True)
     if not (4 <= len(values) <= _RINGS_AT_MOST and values[0] >= 0 and values[-1] < _RINGS_AT_MOST):
         return False
-    elevation = np.arctan2(z.astype(np.float64), np.hypot(x, y))
+    elevation = np.arctan2(z, np.hypot(x, y))
     mean = np.bincount(of_point, elevation) / np.bincount(of_point)
     return bool((values % 1 == 0).all()) and float(
         np.square(elevation - mean[of_point]).mean()

@@ -15,7 +15,10 @@ from lidargrit.scans.columns import parts_of_columns
 from lidargrit.scans.types import Scan
 
 BYTES_AT_MOST = 256_000_000  # 4 million points of 64 bytes; sensors' own files have up to 48 a point
-REFLECTANCE_RULE = "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that holds all values of a file; 8 bits: 255"
+REFLECTANCE_RULE = (
+    "0 to 1, 0 to 255 or 0 to 65535: the smallest of these that holds all values of a file, 0 to 1 also where few do "
+    "not fit among fractions; 8 bits: 255"
+)
 
 _NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
