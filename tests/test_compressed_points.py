@@ -94,13 +94,6 @@ def test_points_far_away_come_back_as_near_as_32_bits_can_say(at):
     assert apart_m(found[np.argsort(found[:, 0])], points_m) <= 0.01
 
 
-@pytest.mark.parametrize("step_mm", ["0", "1001"])
-def test_a_step_that_rounds_nothing_or_everything_is_refused(tmp_path, capsys, step_mm):
-    words = ["compress", "simulated:1", str(tmp_path / "scans.lgz"), "--points", "--step-mm", step_mm]
-    assert main(words) == 2
-    assert "wanted a whole number from 1 to 1,000" in capsys.readouterr().err
-
-
 def test_nothing_and_one_point_come_back_and_what_is_no_place_is_refused():
     for count in (0, 1):
         points_m = np.full((count, 3), 2.5, dtype=np.float32)

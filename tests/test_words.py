@@ -23,7 +23,7 @@ MISTAKES = {
     "simulate here -n 1 --wet very": "got --wet 'very'; wanted a number;",
     "forecast a next -n 0": "got -n 0; wanted a whole number from 1 to",
     "rescan a low --to vlp16 --raised-m nan": "got --raised-m nan; wanted a number from -10 to 10; correct it",
-    "compress a a.lgz --step-mm -5": "got --step-mm -5; wanted a whole number from 1 to 1,000; correct it",
+    "compress a a.lgz --points --step-mm 0": "got --step-mm 0; wanted a whole number from 1 to 1,000; correct it",
     "prepare a --rank 0 --world-size 0": "got --world-size 0; wanted a whole number from 1 to",
     "prepare a --workers 2000": "got --workers 2000; wanted a whole number from 1 to 1,024;",
     "serve --port -1": "got --port -1; wanted a whole number from 0 to 65,535;",

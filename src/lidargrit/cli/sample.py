@@ -47,12 +47,13 @@ def run(options: argparse.Namespace) -> None:
     else:
         rank, world_size = rank_and_world_size(options.rank, options.world_size)
         own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-        run_folder = locate(options.run_folder, job)
-        generator, seeds = load(run_folder, device=options.device or own), seeds[rank::world_size]
+        run_folder, device = locate(options.run_folder, job), options.device or own
+        generator, seeds = load(run_folder, device=device), seeds[rank::world_size]
         generator = generator.for_sensor(sensor or generator.sensor)
         sampling = generator.parse_sampling(words)
         if options.frames:
-            ways, first = [path_of(options.frames, options.path)] * len(seeds), opening_of(options.run_folder)
+            first = opening_of(options.run_folder, device)
+            ways = [path_of(options.frames, options.path)] * len(seeds)
             write_drives(generator, run_folder, options.out, ways, seeds, sampling, first, path=str(options.path))
         else:
             write_samples(generator, run_folder, options.out, seeds, sampling)

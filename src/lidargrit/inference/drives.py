@@ -128,9 +128,9 @@ def continued(drive: str, generator: Generator[Any, Any], frames: int, after: in
     return Way(seen, poses[last + 1 :], times_s[last] + period_s, period_s)
 
 
-def opening_of(name: str | Path) -> Generator[Any, Any] | None:
+def opening_of(name: str | Path, device: str = "cpu") -> Generator[Any, Any] | None:
     """Return the generator of first scans of drives: of a bundle with a run for drives the one that samples."""
-    return load(locate(name)) if locate(name) != locate(name, "drive") else None
+    return load(locate(name), device=device) if locate(name) != locate(name, "drive") else None
 
 
 def write_drives(
