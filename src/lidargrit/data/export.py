@@ -116,7 +116,7 @@ class _Recordings:
             except ScanError as error:
                 if self._config.bad_scans == "refuse":
                     raise
-                reporting.message(f"left out: {error}")
+                reporting.message(f"left out: {error.as_left_out()}")
             else:
                 self._scans.tell_notes(scan)
                 is_empty = False

@@ -113,7 +113,7 @@ class ScanFolder:
         except ScanError as error:
             if self._bad_scans == "refuse":
                 raise
-            reporting.message(f"left out: {error}")
+            reporting.message(f"left out: {error.as_left_out()}")
             self.leave_out(indices)
 
     def leave_out(self, indices: Sequence[int]) -> None:

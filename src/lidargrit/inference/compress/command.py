@@ -130,7 +130,7 @@ class _Compressor:
             except ScanError as error:
                 if not self._skips:
                     raise
-                reporting.message(f"left out: {error}")
+                reporting.message(f"left out: {error.as_left_out()}")
             else:
                 if not self._told and (lost := _not_kept(image)):
                     self._told = True

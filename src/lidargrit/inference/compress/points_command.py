@@ -48,7 +48,7 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
                 except ScanError as error:
                     if config.bad_scans != "skip":
                         raise
-                    reporting.message(f"left out: {error}")
+                    reporting.message(f"left out: {error.as_left_out()}")
                 else:
                     lost = [word for name, word in _NOT_KEPT if getattr(scan, name) is not None]
                     if lost and not told:
