@@ -110,7 +110,7 @@ def test_samples_that_were_added_are_not_taken_for_those_completed_before(folder
     assert open_source(words[2]).sensor.same_rays(model.sensor)
     write_samples(model, folders / "wide_run", samples, [4])
     assert main(words) == 2
-    assert "000000.npy is of another scan of" in capsys.readouterr().err
+    assert "000000.npy is another scan of" in capsys.readouterr().err
 
 
 def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path, capsys):

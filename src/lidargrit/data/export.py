@@ -61,7 +61,8 @@ def export_scans(
         return _Recordings(scans, read, kind, config).write(out, facts)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
-    folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
+    states = [scans.state(index) for index in range(len(files))]
+    folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans, states)
     sensor = change.other if isinstance(change, Rescan) else scans.sensor()
     is_read_so = sensor is not None and layout.sensor and load_sensor(layout.sensor).to_json() == sensor.to_json()
     with folder.writing("exporting") as progress:
@@ -99,7 +100,8 @@ class _Recordings:
         """Write those that are missing, and return the number of recordings that are there then."""
         files, drives = [*self._drives], [*self._drives.values()]
         holds = [" ".join(self._scans.identity(index) for index in drive) for drive in drives]
-        folder = ScanFolder(out, MANIFEST, facts, files, holds, self._config.bad_scans)
+        states = ["; ".join(self._scans.state(index) for index in drive) for drive in drives]
+        folder = ScanFolder(out, MANIFEST, facts, files, holds, self._config.bad_scans, states)
         left = sum(len(drives[number]) for number in folder.missing)
         with folder.writing("exporting", left, len(self._scans)) as progress:
             for number in folder.missing:

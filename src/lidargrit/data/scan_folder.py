@@ -38,6 +38,7 @@ from lidargrit.scans.types import Scan
 
 TREE = "kitti_odometry"  # the data set that reads such a tree back
 IMAGE = "image"  # the word for range images as .npy, in place of a format
+_OF_FILES = "scans", "states"  # entries of a manifest that have a word for each file
 _KITTI_NAME = re.compile(r"\d{2,}/\d{6}")  # sequence and number
 
 
@@ -49,6 +50,7 @@ class ScanFolder:
         manifest: name of the file that says how the scans were made, and which file holds which.
         facts: entries of the manifest, among them the ``source``; a folder with other entries is refused.
         identities: identity of the scan in each file, such as its name in the source.
+        states: what changes where the source's files of that scan do.
 
     Attributes:
         missing: indices of the files that are still to be written.
@@ -62,6 +64,7 @@ class ScanFolder:
         files: Sequence[str],
         identities: Sequence[str],
         bad_scans: Literal["refuse", "skip"] = "refuse",
+        states: Sequence[str] = (),
     ) -> None:
         check_names(facts["source"], files)
         if link := next((out / file for file in files if (out / file).is_symlink()), None):
@@ -69,6 +72,8 @@ class ScanFolder:
             raise OutputError(f"{link}, which is a link", "a file of this command, or none", "remove the link")
         self.out, self.files, self._manifest = out, files, out / manifest
         self._facts = {**facts, "scans": dict(zip(files, identities, strict=True))}
+        if states:
+            self._facts["states"] = dict(zip(files, states, strict=True))
         self._bad_scans, self._left_out, self._told_labels = bad_scans, set[str](), False
         self.missing = [index for index, file in enumerate(files) if not (out / file).exists()]
 
@@ -142,21 +147,25 @@ class ScanFolder:
                 raise OutputError(f"a scan that would lie outside, in {file}", "names below a folder", "rename it")
             user_path(str((self.out / file).absolute()), OutputError)  # refuses names that no file can have
         there = begun_by(self._manifest, self._difference)
-        if there is None:
-            write_json(self._manifest, self._facts)
-        elif not scans.keys() <= there["scans"].keys():
-            write_json(self._manifest, {**self._facts, "scans": {**there["scans"], **scans}})
+        of_both = {
+            name: {**(there or {}).get(name, {}), **self._facts[name]} for name in _OF_FILES if name in self._facts
+        }
+        if {**self._facts, **of_both} != there:
+            write_json(self._manifest, {**self._facts, **of_both})
 
     def _difference(self, there: dict[str, Any]) -> str:
-        known, facts, scans = there.get("scans"), self._facts, self._facts["scans"]
-        if not isinstance(known, dict):
+        known, states, facts, scans = there.get("scans"), there.get("states", {}), self._facts, self._facts["scans"]
+        if not (isinstance(known, dict) and isinstance(states, dict)):
             return f"whose {self._manifest.name} lists no scans"
         if other := [
-            name for name in sorted({*there, *self._facts} - {"scans"}) if there.get(name) != self._facts.get(name)
+            name for name in sorted({*there, *self._facts} - {*_OF_FILES}) if there.get(name) != self._facts.get(name)
         ]:
             return f"whose {self._manifest.name} has another {other[0]!r}"
-        changed = next((file for file, name in scans.items() if known.get(file, name) != name), None)
-        return f"where {changed} is of another scan of {facts['source']}, or of one that has changed" if changed else ""
+        if other := next((file for file, name in scans.items() if known.get(file, name) != name), None):
+            return f"where {other} is another scan of {facts['source']}"
+        missing, now = {self.files[index] for index in self.missing}, facts.get("states", {})
+        changed = next((file for file in now if file not in missing and states.get(file, now[file]) != now[file]), "")
+        return f"where {changed} is of a scan of {facts['source']} that has changed since" if changed else ""
 
 
 def write_sensor(out: Path, sensor: SensorModel) -> None:

@@ -39,6 +39,10 @@ class NamedScans(ABC):
     def identity(self, index: int) -> str:
         """Return what identifies a scan, so that another scan is not taken for it."""
 
+    def state(self, index: int) -> str:
+        """Return what changes where the files of a scan do; "" where it has none that are known."""
+        return ""
+
     def number(self, index: int) -> int:
         """Return the number of a scan in its source, whatever other scans are taken."""
         return index
@@ -91,13 +95,17 @@ class PointScans(NamedScans):
         return self._dataset.name(self._indices[index])
 
     def identity(self, index: int) -> str:
-        """Return its name in the data set, with the sizes and times of the files that hold it, if any."""
+        """Return its name in the data set."""
+        return self.name(index)
+
+    def state(self, index: int) -> str:
+        """Return the sizes and times of the files that hold it."""
         own, states = self.path(index), list[str]()
         for path in () if own is None else (own, *self._dataset.sidecar_files(self._indices[index])):
             with suppress(OSError):  # of a file that is not there; the scan's own is told when it is read
                 status = path.stat()
                 states.append(f"{status.st_size} bytes of {status.st_mtime_ns} ns")
-        return ", ".join((self.name(index), *states))
+        return ", ".join(states)
 
     def number(self, index: int) -> int:
         """Return its number in the data set."""

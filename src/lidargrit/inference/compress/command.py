@@ -117,7 +117,7 @@ class _Compressor:
 
     def identity(self, index: int) -> str:
         """Return what identifies a scan; of a drive its place, too, by which those behind it are compressed."""
-        named = self.inputs.scans.identity(index)
+        named = f"{self.inputs.scans.identity(index)} {self.inputs.scans.state(index)}"
         return named if self._drives is None else f"{named}, placed at {self._drives.place(index, 0)[1:]}"
 
     def write(self, folder: Path, indices: Sequence[int]) -> int:

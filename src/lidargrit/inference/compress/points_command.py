@@ -38,7 +38,8 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     header, told = {_MARK: True, "step_mm": step_mm, "lidargrit": __version__}, False
     with writing(out, header, chosen) as writer:
-        missing = writer.missing([scans.identity(index) for index in range(len(scans))])
+        identities = [f"{scans.identity(index)} {scans.state(index)}" for index in range(len(scans))]
+        missing = writer.missing(identities)
         with reporting.progress("compressing", len(scans), len(scans) - len(missing)) as progress:
             for index in missing:
                 data, count = b"", 0
@@ -54,7 +55,7 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
                     if lost and not told:
                         reporting.message(f".lgz keeps no {' and no '.join(lost)}")
                     told = told or bool(lost)
-                add_scan(writer.folder, index, (names[index], scans.identity(index), count), data)
+                add_scan(writer.folder, index, (names[index], identities[index], count), data)
                 progress.advance(1)
         counts = writer.sizes()
         if not counts:
