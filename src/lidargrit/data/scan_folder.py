@@ -50,7 +50,7 @@ class ScanFolder:
         manifest: name of the file that says how the scans were made, and which file holds which.
         facts: entries of the manifest, among them the ``source``; a folder with other entries is refused.
         identities: identity of the scan in each file, such as its name in the source.
-        states: what changes where the source's files of that scan do.
+        states: sizes and times of the source's files of the scan in each file; none if they are not known.
 
     Attributes:
         missing: indices of the files that are still to be written.
