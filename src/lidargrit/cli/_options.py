@@ -5,7 +5,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.untrusted import WholeNumber, whole_number
+from lidargrit.core.untrusted import WholeNumber, step_in_mm, whole_number
 
 if TYPE_CHECKING:
     from lidargrit.data.prepared.config import ScanSettings
@@ -91,6 +91,11 @@ def add_count(
 ) -> None:
     """Add ``-n``/``--count``, the number of scans."""
     parser.add_argument("-n", "--count", type=number, default=default, metavar="N", help=help)
+
+
+def add_step(parser: argparse.ArgumentParser, help: str) -> None:
+    """Add ``--step-mm``, the step that ranges or coordinates are rounded to, in millimetres."""
+    parser.add_argument("--step-mm", type=step_in_mm, default=10, metavar="MM", help=help)
 
 
 def add_rank(parser: argparse.ArgumentParser, what: str) -> None:

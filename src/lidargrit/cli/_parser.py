@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from lidargrit.cli._catalogue import entries
 from lidargrit.core.errors import UsageError, nearest_names, one_of
-from lidargrit.core.untrusted import Number, WholeNumber, check_path, check_word, whole_number
+from lidargrit.core.untrusted import Number, check_path, check_word, whole_number
 
 EXIT_CODES = """\
 exit codes: 0 done, 1 a fault of lidargrit's own (with a traceback), 2 a mistake of the user (explained in one line),
@@ -156,7 +156,7 @@ def _name_of(action: argparse.Action) -> str:
 
 
 def _is_number(action: argparse.Action) -> bool:
-    return action.type in (int, float) or isinstance(action.type, (Number, WholeNumber))
+    return action.type in (int, float) or isinstance(action.type, Number)
 
 
 def script(parser: Parser, shell: str) -> str:

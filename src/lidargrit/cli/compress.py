@@ -3,9 +3,8 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_count, add_ray, add_scans, refuse_unused, scan_settings
+from lidargrit.cli._options import add_count, add_ray, add_scans, add_step, refuse_unused, scan_settings
 from lidargrit.core.errors import counted_scans
-from lidargrit.core.untrusted import step_in_mm
 
 EXAMPLES = """\
   lidargrit compress /data/kitti_odometry scans.lgz
@@ -23,8 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("scans", help="scans: a file, a folder, NAME:ROOT:SPLIT, samples, prepared scans, or range images as .npy")
     add("out", type=Path, metavar="OUT.lgz", help="file to write")
     add("--model", default="pretrained", help="run with a pixel decoder (default: pretrained)")
-    step = {"type": step_in_mm, "default": 10, "metavar": "MM"}
-    add("--step-mm", **step, help="ranges, or coordinates, change by half of it at most")
+    add_step(parser, "ranges, or coordinates, change by half of it at most")
     add("--points", action="store_true", help="keep all points and reflectance, by no model")
     add_count(parser)
     add_scans(parser)

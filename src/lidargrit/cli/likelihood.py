@@ -3,9 +3,8 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._options import add_count, add_device, add_scans, scan_settings
+from lidargrit.cli._options import add_count, add_device, add_scans, add_step, scan_settings
 from lidargrit.cli._results import add_json, print_result, refuse_taken
-from lidargrit.core.untrusted import step_in_mm
 
 EXAMPLES = """\
   lidargrit likelihood simulated:64:test
@@ -18,8 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scans", help="source of scans: a file's folder, NAME:ROOT:SPLIT, samples, or prepared scans")
     add("--model", default="pretrained", help="run whose probabilities count (default: pretrained)")
-    step = {"type": step_in_mm, "default": 10, "metavar": "MM"}
-    add("--step-mm", **step, help="step in millimetres that ranges are rounded to first")
+    add_step(parser, "step in millimetres that ranges are rounded to first")
     add_count(parser)
     bits = "also write the bits of every pixel: float32 (scans, rows, columns)"
     add("--map", type=Path, metavar="FILE.npy", help=bits)

@@ -195,6 +195,15 @@ def _sweep(hidden: Path) -> None:
         hidden.rmdir()
 
 
+def state_of(path: Path) -> tuple[int, int] | None:
+    """Return the size of a file in bytes and its time in nanoseconds, of which one changes with it; None without it."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns
+
+
 def is_taken(folder: Path) -> bool:
     """Return whether a folder holds anything but partial files, or is no folder at all."""
     if not folder.is_dir():

@@ -8,7 +8,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from lidargrit.core.errors import CheckpointError, DataError, LidarGritError, UsageError
 
@@ -115,21 +115,44 @@ def user_path(text: str, error: type[LidarGritError] = DataError) -> Path:
 
 
 @dataclass(frozen=True)
-class WholeNumber:
-    """A word → a whole number within bounds; UsageError names the bounds."""
+class Number:
+    """A word → a number within bounds, neither NaN nor infinite; UsageError names the bounds."""
+
+    at_least: float = 0.0
+    at_most: float = NUMBER_AT_MOST
+    _kind: ClassVar[str] = "a number"
+    _form: ClassVar[str] = ",g"
+
+    def __call__(self, word: str) -> float:
+        """Return the number."""
+        try:
+            value = self._value(word)
+        except ValueError:
+            raise UsageError(repr(word[:40]), self._kind, "correct it") from None
+        if not self.at_least <= value <= self.at_most:  # refuses NaN too
+            bounds = f"{self.at_least:{self._form}} to {self.at_most:{self._form}}"
+            raise UsageError(word[:40], f"{self._kind} from {bounds}", "correct it")
+        return value
+
+    def _value(self, word: str) -> float:
+        return float(word)
+
+
+@dataclass(frozen=True)
+class WholeNumber(Number):
+    """A word → a whole number within bounds, none of them below 0; UsageError names the bounds."""
 
     at_least: int = 0
     at_most: int = COUNT_AT_MOST
+    _kind: ClassVar[str] = "a whole number"
+    _form: ClassVar[str] = ","
 
     def __call__(self, word: str) -> int:
         """Return the number."""
-        try:
-            value = int(word) if len(word) <= 40 else -1  # Python needs quadratic time for long ones
-        except ValueError:
-            raise UsageError(repr(word), "a whole number", "correct it") from None
-        if not self.at_least <= value <= self.at_most:
-            raise UsageError(word[:40], f"a whole number from {self.at_least} to {self.at_most:,}", "correct it")
-        return value
+        return int(super().__call__(word))
+
+    def _value(self, word: str) -> int:
+        return int(word) if len(word) <= 40 else -1  # Python needs quadratic time for long ones
 
 
 whole_number, seed_number = WholeNumber(), WholeNumber(at_most=SEED_AT_MOST)
@@ -142,24 +165,6 @@ def seeds_in_a_row(first: int, count: int) -> range:
         got = f"--seed {first} with -n {count}, of which the last scan has the seed {first + count - 1}"
         raise UsageError(got, f"seeds up to {SEED_AT_MOST}", "lower one of the two")
     return range(first, first + count)
-
-
-@dataclass(frozen=True)
-class Number:
-    """A word → a number within bounds, neither NaN nor infinite; UsageError names the bounds."""
-
-    at_least: float = 0.0
-    at_most: float = NUMBER_AT_MOST
-
-    def __call__(self, word: str) -> float:
-        """Return the number."""
-        try:
-            value = float(word)
-        except ValueError:
-            raise UsageError(repr(word[:40]), "a number", "correct it") from None
-        if not self.at_least <= value <= self.at_most:  # refuses NaN too
-            raise UsageError(word[:40], f"a number from {self.at_least:g} to {self.at_most:,g}", "correct it")
-        return value
 
 
 _JSON_NAMES: dict[type, str] = {

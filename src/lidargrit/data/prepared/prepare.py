@@ -13,7 +13,7 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
 from lidargrit.core.errors import DataError, OutputError, counted_scans, no_usable_scan
-from lidargrit.core.files import claim_folder, is_taken, sha256_of_json, write_json, write_text
+from lidargrit.core.files import claim_folder, is_taken, sha256_of_json, state_of, write_json, write_text
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
@@ -178,20 +178,17 @@ def _spec(
     fine, scans, beside = sensor.fine(), [], []
     for index in evenly_spaced(config.max_scans or len(dataset), len(dataset)):
         path = dataset.path(index)
-        try:
-            status = None if path is None else path.stat()
-        except OSError:
-            if config.bad_scans == "refuse":
-                raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link") from None
-            status = None  # it is left out, and named, when it is read
+        state = None if path is None else state_of(path)
+        if path is not None and state is None and config.bad_scans == "refuse":  # else left out when it is read
+            raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link")
         name = (
             dataset.name(index)
             if path is None
             else "".join((str(path.resolve()), *dataset.name(index).partition("#")[1:]))
         )
-        size, time_ns = (status.st_size, status.st_mtime_ns) if status else (0, 0)
-        scans.append((name, dataset.recording(index), size, time_ns, *_time_and_pose(dataset, index)))
-        beside += filter(None, map(_state, dataset.sidecar_files(index)))
+        scans.append((name, dataset.recording(index), *(state or (0, 0)), *_time_and_pose(dataset, index)))
+        known = ((other.name, state_of(other)) for other in dataset.sidecar_files(index))
+        beside += [(other, *state) for other, state in known if state]
     others = json.dumps(beside) if beside else ""
     # The sensor by which scans are simulated is in no name of theirs, and its file may change.
     if isinstance(dataset, Streets) and dataset.sensor != Streets.sensor:
@@ -224,15 +221,6 @@ def _time_and_pose(dataset: ScanDataset, index: int) -> tuple[float, list[float]
     if motion.time_s is None:
         return ()
     return motion.time_s, None if motion.pose is None else motion.pose.flatten().tolist()
-
-
-def _state(path: Path) -> tuple[str, int, int] | None:
-    """Return the name, the size and the time of a file that is read beside a scan; None if it is not there."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return path.name, status.st_size, status.st_mtime_ns
 
 
 def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[Any, ...]]) -> None:

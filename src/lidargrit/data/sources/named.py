@@ -10,6 +10,7 @@ from pathlib import Path
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, OutputError, printable
+from lidargrit.core.files import state_of
 from lidargrit.data.datasets import ScanDataset, Window
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
@@ -100,12 +101,9 @@ class PointScans(NamedScans):
 
     def state(self, index: int) -> str:
         """Return the sizes and times of the files that hold it."""
-        own, states = self.path(index), list[str]()
-        for path in () if own is None else (own, *self._dataset.sidecar_files(self._indices[index])):
-            with suppress(OSError):  # of a file that is not there; the scan's own is told when it is read
-                status = path.stat()
-                states.append(f"{status.st_size} bytes of {status.st_mtime_ns} ns")
-        return ", ".join(states)
+        own = self.path(index)
+        files = () if own is None else (own, *self._dataset.sidecar_files(self._indices[index]))
+        return ", ".join("{} bytes of {} ns".format(*state) for state in map(state_of, files) if state)
 
     def number(self, index: int) -> int:
         """Return its number in the data set."""

@@ -139,8 +139,12 @@ class FileDataset(ScanDataset):
         return self.recording_of(path) if self._is_its_own else unnamed_recording(path)
 
     @cached_property
+    def _origin(self) -> str:
+        return self.origin_of(self.root)  # asked for every scan, and looked up once
+
+    @property
     def _is_its_own(self) -> bool:
-        return self.origin_of(self.root) == self.public_name()  # asked for every scan, and looked up once
+        return self._origin == self.public_name()
 
     @classmethod
     def origin_of(cls, root: Path) -> str:
@@ -155,8 +159,7 @@ class FileDataset(ScanDataset):
     @property
     def named_sensor(self) -> str:
         """Name or file of the sensor; "" in a folder of others' files that name none."""
-        is_of_others = self.origin_of(self.root) == "folder"
-        return "" if is_of_others and self.sensor == type(self).sensor else self.sensor
+        return "" if self._origin == "folder" and self.sensor == type(self).sensor else self.sensor
 
     @classmethod
     def matches(cls, root: Path) -> bool:
