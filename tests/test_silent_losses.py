@@ -362,3 +362,26 @@ def test_a_file_that_is_read_is_never_replaced(tmp_path, monkeypatch, capsys, wo
     assert main([words[0], "a.png", *words[1:]]) == 2
     assert "which is also read; wanted another name" in capsys.readouterr().err
     assert picture.read_bytes() == b"somebody's"
+
+
+@pytest.mark.parametrize("kind", ["npy", "tensors"])
+def test_images_that_have_changed_are_not_taken_for_those_that_were_written(tmp_path, capsys, kind):
+    scans, out = tmp_path / "scans", tmp_path / "out"
+    scans.mkdir()
+    if kind == "npy":
+        (scans / "sensor.json").write_text(json.dumps(K360.with_columns(128).to_json()))
+
+    def save(range_m):
+        if kind == "npy":
+            np.save(scans / "one.npy", np.full((64, 128), range_m, np.float32))
+        else:
+            torch.save(torch.full((1, 64, 1024), range_m), scans / "one.pth")
+
+    save(5.0)
+    command = ["export", str(scans), str(out), "--format", "ply"]
+    assert main(command) == 0
+    assert main(command) == 0, "the same command goes on"
+    save(6.0)
+    capsys.readouterr()
+    assert main(command) == 2
+    assert f"of a scan of {scans} that has changed since" in capsys.readouterr().err

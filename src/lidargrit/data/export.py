@@ -9,7 +9,7 @@ from lidargrit.core.errors import ConfigError, ScanError, printable
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.recordings import KINDS, recording_of, write_recording
-from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, writable_format
+from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, ScanIdentity, writable_format
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
@@ -61,8 +61,7 @@ def export_scans(
         return _Recordings(scans, read, kind, config).write(out, facts)
     files = layout.files([scans.name(index) for index in range(len(scans))])
     identities = [scans.identity(index) for index in range(len(scans))]
-    states = [scans.state(index) for index in range(len(files))]
-    folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans, states)
+    folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     sensor = change.other if isinstance(change, Rescan) else scans.sensor()
     is_read_so = sensor is not None and layout.sensor and load_sensor(layout.sensor).to_json() == sensor.to_json()
     with folder.writing("exporting") as progress:
@@ -99,9 +98,9 @@ class _Recordings:
     def write(self, out: Path, facts: dict[str, Any]) -> int:
         """Write those that are missing, and return the number of recordings that are there then."""
         files, drives = [*self._drives], [*self._drives.values()]
-        holds = [" ".join(self._scans.identity(index) for index in drive) for drive in drives]
-        states = ["; ".join(self._scans.state(index) for index in drive) for drive in drives]
-        folder = ScanFolder(out, MANIFEST, facts, files, holds, self._config.bad_scans, states)
+        each = [[self._scans.identity(index) for index in drive] for drive in drives]
+        holds = [ScanIdentity(" ".join(one.name for one in of), "; ".join(one.state for one in of)) for of in each]
+        folder = ScanFolder(out, MANIFEST, facts, files, holds, self._config.bad_scans)
         left = sum(len(drives[number]) for number in folder.missing)
         with folder.writing("exporting", left, len(self._scans)) as progress:
             for number in folder.missing:

@@ -6,6 +6,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
 from itertools import accumulate, chain
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -99,6 +100,13 @@ class TimedStore(Protocol):
     motions: Sequence[Motion]
 
 
+@runtime_checkable
+class FileStore(Protocol):
+    """A source of pixels of images that each lie in a file; some may share one."""
+
+    files: Sequence[Path]
+
+
 class RangeImages:
     """Range images in one or more stores, numbered through, of one sensor unless sets of several are joined.
 
@@ -146,6 +154,12 @@ class RangeImages:
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
 
+    def files(self, index: int) -> Sequence[Path]:
+        """Return the file that holds an image; none where it is not known."""
+        part, number = self._located(index)
+        store = self._stores[part]
+        return store.files[number : number + 1] if isinstance(store, FileStore) else ()
+
     @property
     def provenance(self) -> Provenance:
         """Provenance of all images, in their order."""
@@ -192,9 +206,13 @@ class RangeImages:
         }
         return RangeImage(range_m, range_m > 0, self.sensor_of(indices[0]) if indices else self.sensor, planes)
 
-    def _pixels(self, index: int, first_column: int) -> Pixels:
+    def _located(self, index: int) -> tuple[int, int]:
         part = bisect_right(self._ends, index)
-        store, number = self._stores[part], index - (self._ends[part - 1] if part else 0)
+        return part, index - (self._ends[part - 1] if part else 0)
+
+    def _pixels(self, index: int, first_column: int) -> Pixels:
+        part, number = self._located(index)
+        store = self._stores[part]
         whole = store.read(number)
         if lacking := self._planes - whole.planes.keys():
             names = store.provenance.names

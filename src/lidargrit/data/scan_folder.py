@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -42,6 +42,21 @@ _OF_FILES = "scans", "states"  # entries of a manifest that have a word for each
 _KITTI_NAME = re.compile(r"\d{2,}/\d{6}")  # sequence and number
 
 
+class ScanIdentity(NamedTuple):
+    """What identifies a scan, so that neither another one nor a changed one is taken for it.
+
+    Args:
+        name: its name in its source, or how it was made.
+        state: sizes and times of the files that hold it; "" where none are known.
+    """
+
+    name: str
+    state: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.state}"
+
+
 class ScanFolder:
     """A folder of scans that a command writes; files that are there already are not written again.
 
@@ -49,8 +64,7 @@ class ScanFolder:
         out: an empty folder, or one that the same command began; more scans can be added to it.
         manifest: name of the file that says how the scans were made, and which file holds which.
         facts: entries of the manifest, among them the ``source``; a folder with other entries is refused.
-        identities: identity of the scan in each file, such as its name in the source.
-        states: sizes and times of the source's files of the scan in each file; none if they are not known.
+        identities: identity of the scan in each file.
 
     Attributes:
         missing: indices of the files that are still to be written.
@@ -62,18 +76,18 @@ class ScanFolder:
         manifest: str,
         facts: dict[str, Any],
         files: Sequence[str],
-        identities: Sequence[str],
+        identities: Sequence[ScanIdentity],
         bad_scans: Literal["refuse", "skip"] = "refuse",
-        states: Sequence[str] = (),
     ) -> None:
         check_names(facts["source"], files)
         if link := next((out / file for file in files if (out / file).is_symlink()), None):
             # What it leads to is not of this command, and would count as written.
             raise OutputError(f"{link}, which is a link", "a file of this command, or none", "remove the link")
         self.out, self.files, self._manifest = out, files, out / manifest
-        self._facts = {**facts, "scans": dict(zip(files, identities, strict=True))}
-        if states:
-            self._facts["states"] = dict(zip(files, states, strict=True))
+        of_files = dict(zip(files, identities, strict=True))
+        self._facts = {**facts, "scans": {file: scan.name for file, scan in of_files.items()}}
+        if states := {file: scan.state for file, scan in of_files.items() if scan.state}:
+            self._facts["states"] = states
         self._bad_scans, self._left_out, self._told_labels = bad_scans, set[str](), False
         self.missing = [index for index, file in enumerate(files) if not (out / file).exists()]
 
@@ -164,7 +178,9 @@ class ScanFolder:
         if other := next((file for file, name in scans.items() if known.get(file, name) != name), None):
             return f"where {other} is another scan of {facts['source']}"
         missing, now = {self.files[index] for index in self.missing}, facts.get("states", {})
-        changed = next((file for file in now if file not in missing and states.get(file, now[file]) != now[file]), "")
+        changed = next(
+            (file for file in now if file not in missing and (states.get(file) or now[file]) != now[file]), ""
+        )
         return f"where {changed} is of a scan of {facts['source']} that has changed since" if changed else ""
 
 

@@ -18,7 +18,7 @@ from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.run_folder import locate
-from lidargrit.data.scan_folder import KittiTree, ScanFolder
+from lidargrit.data.scan_folder import KittiTree, ScanFolder, ScanIdentity
 from lidargrit.data.sources import open_source
 from lidargrit.data.trajectories import read_trajectory
 from lidargrit.data.windows import drives_in
@@ -166,7 +166,9 @@ def write_drives(
         raise ConfigError(got, f"those of {generator.sensor.name!r}", "name a run of that sensor")
     names = [f"{drive:02d}/{frame:06d}" for drive, way in enumerate(ways) for frame in range(len(way.poses))]
     identities = [
-        f"seed {seed}, frame {n}" for seed, way in zip(seeds, ways, strict=True) for n in range(len(way.poses))
+        ScanIdentity(f"seed {seed}, frame {n}")
+        for seed, way in zip(seeds, ways, strict=True)
+        for n in range(len(way.poses))
     ]
     identity = {"source": str(run_folder), **facts, **sampling_identity(generator, run_folder, settings)}
     folder = ScanFolder(out, MANIFEST, identity, KittiTree(out).files(names), identities)

@@ -106,14 +106,14 @@ def _entries(path: Path) -> list[Path]:
 
 class _ImageFiles:
     def __init__(self, paths: list[Path], sensor: SensorModel) -> None:
-        self._paths, self._sensor, self._told = paths, sensor, False
+        self.files, self._sensor, self._told = paths, sensor, False
         self.provenance = Provenance(tuple(str(path.absolute()) for path in paths))
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self.files)
 
     def read(self, index: int) -> Pixels:
-        path, sensor = self._paths[index], self._sensor
+        path, sensor = self.files[index], self._sensor
         range_m = _array(path)
         if range_m.shape not in {(sensor.height, sensor.width), (sensor.height, sensor.width * sensor.column_stride)}:
             raise ScanError(

@@ -2,7 +2,7 @@
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from lidargrit.core.files import state_of
 from lidargrit.data.datasets import ScanDataset, Window
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.scan_folder import ScanIdentity
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.source import Source
@@ -37,12 +38,8 @@ class NamedScans(ABC):
         """Return the name of the file that is written for a scan, without the ending."""
 
     @abstractmethod
-    def identity(self, index: int) -> str:
-        """Return what identifies a scan, so that another scan is not taken for it."""
-
-    def state(self, index: int) -> str:
-        """Return what changes where the files of a scan do; "" where it has none that are known."""
-        return ""
+    def identity(self, index: int) -> ScanIdentity:
+        """Return what identifies a scan."""
 
     def number(self, index: int) -> int:
         """Return the number of a scan in its source, whatever other scans are taken."""
@@ -95,15 +92,11 @@ class PointScans(NamedScans):
         """Return its name in the data set."""
         return self._dataset.name(self._indices[index])
 
-    def identity(self, index: int) -> str:
-        """Return its name in the data set."""
-        return self.name(index)
-
-    def state(self, index: int) -> str:
-        """Return the sizes and times of the files that hold it."""
+    def identity(self, index: int) -> ScanIdentity:
+        """Return its name in the data set, and the state of its file and of those beside it."""
         own = self.path(index)
         files = () if own is None else (own, *self._dataset.sidecar_files(self._indices[index]))
-        return ", ".join("{} bytes of {} ns".format(*state) for state in map(state_of, files) if state)
+        return ScanIdentity(self.name(index), _state(files))
 
     def number(self, index: int) -> int:
         """Return its number in the data set."""
@@ -166,9 +159,10 @@ class ImageScans(NamedScans):
         """Return its name."""
         return self._names[self._numbers[index]]
 
-    def identity(self, index: int) -> str:
+    def identity(self, index: int) -> ScanIdentity:
         """Return which file it is, which model's seed, or whose scan it was projected from."""
-        return self.images.provenance.names[self._numbers[index]]
+        number = self._numbers[index]
+        return ScanIdentity(self.images.provenance.names[number], _state(self.images.files(number)))
 
     def number(self, index: int) -> int:
         """Return its number in the source."""
@@ -196,6 +190,10 @@ class ImageScans(NamedScans):
 
     def check_output(self, out: Path) -> None:
         """Accept every folder: images are looked for in one folder alone, by names that are not written there."""
+
+
+def _state(files: Iterable[Path]) -> str:
+    return ", ".join("{} bytes of {} ns".format(*state) for state in map(state_of, files) if state)
 
 
 def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None = None) -> PointScans | ImageScans:

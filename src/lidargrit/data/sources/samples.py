@@ -82,14 +82,14 @@ def is_sample_folder(folder: Path) -> bool:
 
 class _Files:
     def __init__(self, paths: list[Path], sensor: SensorModel, model_and_sampling: str) -> None:
-        self._paths, self._shape = paths, (sensor.height, sensor.width)
+        self.files, self._shape = paths, (sensor.height, sensor.width)
         self.provenance = Provenance(tuple(f"{model_and_sampling}/sample {path.stem}" for path in paths))
 
     def __len__(self) -> int:
-        return len(self._paths)
+        return len(self.files)
 
     def read(self, index: int) -> Pixels:
-        path = self._paths[index]
+        path = self.files[index]
         cure = "remove the file and sample again"
         try:
             with open_file(path, "an .npz with range_m") as file:

@@ -121,8 +121,7 @@ class _Completion:
         files = _files(inputs, source, output)
         facts = {"verb": task.verb, "source": source, **task.identity(), **_facts(model, output)}
         identities = [inputs.scans.identity(number // output.count) for number in range(len(files))]
-        states = [inputs.scans.state(number // output.count) for number in range(len(files))]
-        folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans, states)
+        folder = ScanFolder(out, "completed.json", facts, files, identities, config.bad_scans)
         return cls(inputs, folder, model, task, output)
 
     def write(self, jobs: Iterable[_Job]) -> "Iterator[Written]":

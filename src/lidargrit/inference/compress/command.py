@@ -15,7 +15,7 @@ from lidargrit.core.shares import each_done
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate, projection_variant
-from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format, write_array
+from lidargrit.data.scan_folder import IMAGE, ScanFolder, ScanIdentity, check_names, writable_format, write_array
 from lidargrit.data.sources.named import NamedScans
 from lidargrit.generation.generator import load
 from lidargrit.inference.complete.inputs import Inputs, ScanReader, open_inputs
@@ -117,7 +117,7 @@ class _Compressor:
 
     def identity(self, index: int) -> str:
         """Return what identifies a scan; of a drive its place, too, by which those behind it are compressed."""
-        named = f"{self.inputs.scans.identity(index)} {self.inputs.scans.state(index)}"
+        named = str(self.inputs.scans.identity(index))
         return named if self._drives is None else f"{named}, placed at {self._drives.place(index, 0)[1:]}"
 
     def write(self, folder: Path, indices: Sequence[int]) -> int:
@@ -199,7 +199,7 @@ def decompress_scans(path: Path, out: Path, model: str | None, kind: str | None,
     names = [archive.names[index] for index in indices]
     facts = {"source": path.name, "index_crc32": archive.index_crc32}
     facts |= {"step_mm": codec.steps.step_mm, "format": kind}
-    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], names)
+    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], [*map(ScanIdentity, names)])
     with folder.writing("decompressing") as progress:
         for number in folder.missing:
             image, file = read(indices[number]), out / folder.files[number]

@@ -9,7 +9,7 @@ from lidargrit.core import reporting
 from lidargrit.core.errors import ScanError, UsageError, no_usable_scan
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.scan_folder import IMAGE, ScanFolder, check_names, writable_format
+from lidargrit.data.scan_folder import IMAGE, ScanFolder, ScanIdentity, check_names, writable_format
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import PointScans, named_scans
 from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
@@ -38,7 +38,7 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
     chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
     header, told = {_MARK: True, "step_mm": step_mm, "lidargrit": __version__}, False
     with writing(out, header, chosen) as writer:
-        identities = [f"{scans.identity(index)} {scans.state(index)}" for index in range(len(scans))]
+        identities = [str(scans.identity(index)) for index in range(len(scans))]
         missing = writer.missing(identities)
         with reporting.progress("compressing", len(scans), len(scans) - len(missing)) as progress:
             for index in missing:
@@ -85,7 +85,7 @@ def decompress_points(archive: Archive, out: Path, kind: str, indices: Sequence[
         raise not_reproduced()
     codec, names = PointCodec(step_mm), [archive.names[index] for index in indices]
     facts = {"source": archive.path.name, "index_crc32": archive.index_crc32, "step_mm": step_mm, "format": kind}
-    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], names)
+    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], [*map(ScanIdentity, names)])
     with folder.writing("decompressing") as progress:
         for number in folder.missing:
             points_m, reflectance = codec.decompress(archive.read(indices[number]))

@@ -168,6 +168,7 @@ class _Tensors:
             self._scans = [self._scans[index] for index in evenly_spaced(count, len(self._scans))]
         if not self._scans:
             raise DataError(f"no scan in {paths[0].parent}", "samples as tensors", "remove empty files, or sample anew")
+        self.files = [path for path, _ in self._scans]
         self.provenance = Provenance(tuple(f"{path} {index or 0}" for path, index in self._scans))
 
     def __len__(self) -> int:
