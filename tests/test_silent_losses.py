@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import sqlite3
 import subprocess
 import sys
@@ -385,3 +386,15 @@ def test_images_that_have_changed_are_not_taken_for_those_that_were_written(tmp_
     capsys.readouterr()
     assert main(command) == 2
     assert f"of a scan of {scans} that has changed since" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["export", "--format", "npz"], ["view", "-n", "2"]])
+def test_points_that_are_dropped_are_counted_once_for_all_scans(kitti, tmp_path, capsys, words):
+    for number, path in enumerate(sorted(kitti.glob("*.bin")), start=1):
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        points[:number] = np.nan
+        points.tofile(path)
+    out = ["-o", str(tmp_path / "view.png")] if words[0] == "view" else [str(tmp_path / "out")]
+    assert main([words[0], str(kitti), *out, *words[1:], "--bad-points", "drop"]) == 0
+    told = re.findall(r": [12] of [\d,]+ points left out: NaN, infinite or at the origin\n", capsys.readouterr().err)
+    assert len(told) == 1

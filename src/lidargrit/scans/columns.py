@@ -120,9 +120,12 @@ def columns_of_arrays(xyz: np.ndarray | Tensor, **values: Values | None) -> dict
 
 
 def usable_parts(parts: ScanParts) -> ScanParts:
-    """Return the parts of a scan without points that are no returns."""
+    """Return the parts of a scan without points that are no returns, which a note counts."""
     kept = usable_points(parts["points_xyz_m"], parts.get("reflectance"))
-    return {**parts, **selected(parts, kept)}
+    if bool(kept.all()):
+        return parts
+    told = f"{int((~kept).sum()):,} of {len(kept):,} points left out: NaN, infinite or at the origin"
+    return {**parts, **selected(parts, kept), "notes": (*parts.get("notes", ()), told)}
 
 
 def selected(parts: ScanParts, which: Tensor) -> ScanParts:

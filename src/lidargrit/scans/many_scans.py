@@ -1,5 +1,6 @@
-"""Many scans that are read when asked for → those of them that can be used."""
+"""Many scans that are read when asked for → those of them that can be used, and what is told of them."""
 
+import re
 from collections.abc import Iterable
 from typing import Protocol, runtime_checkable
 
@@ -7,6 +8,7 @@ from lidargrit.core.errors import ScanError
 from lidargrit.scans.types import Scan
 
 _TOLD_AT_MOST = 5  # scans that are left out
+_NUMBER = re.compile(r"-?\d[\d.,]*")
 
 
 @runtime_checkable
@@ -25,6 +27,20 @@ class ManyScans(Protocol):
     def scan(self, index: int) -> Scan:
         """Read one scan."""
         ...
+
+
+def untold(notes: Iterable[str], told: set[str]) -> list[str]:
+    """Return the notes that differ from one another, and from those that were told, in more than numbers.
+
+    Args:
+        told: what was told so far, without its numbers; the notes are added to it.
+    """
+    new = list[str]()
+    for note in notes:
+        if (kind := _NUMBER.sub("", note)) not in told:
+            told.add(kind)
+            new.append(note)
+    return new
 
 
 def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:

@@ -7,6 +7,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.prepared.config import DataConfig
+from lidargrit.scans.many_scans import untold
 from lidargrit.scans.projection import projection_that_fits
 from lidargrit.scans.projection.sensor_check import told_doubts
 from lidargrit.scans.sensors import SensorModel
@@ -52,7 +53,7 @@ def choose_projection(source: str, dataset: ScanDataset, sensor: SensorModel, co
     if config.projection != "sensor":
         sensor = replace(sensor, projection=config.projection)
     probes = _probes(dataset, sensor)
-    told = dict.fromkeys((*dataset.notes, *(note for scan in probes for note in scan.notes)))
+    told = untold((*dataset.notes, *(note for scan in probes for note in scan.notes)), set())
     notes = [f"{source}: {note}" for note in told]
     fitting = {projection_that_fits(scan, sensor) for scan in probes} if config.projection == "sensor" else set()
     if fitting - {sensor.projection}:

@@ -1,6 +1,5 @@
 """An opened source → its scans one after the other, each with the name of the file that is written for it."""
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -19,12 +18,10 @@ from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.source import Source
 from lidargrit.data.windows import TimedScan
-from lidargrit.scans.many_scans import usable_scans
+from lidargrit.scans.many_scans import untold, usable_scans
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
-
-_NUMBER = re.compile(r"-?\d[\d.,]*")
 
 
 class NamedScans(ABC):
@@ -118,10 +115,8 @@ class PointScans(NamedScans):
     def tell_notes(self, scan: Scan) -> None:
         """Report what is noted of the data set and of a scan; notes that differ in numbers alone once."""
         for of, notes in ((str(self._dataset.root), self._dataset.notes), (scan.source, scan.notes)):
-            for note in notes:
-                if (kind := _NUMBER.sub("", note)) not in self._told:
-                    self._told.add(kind)
-                    reporting.message(f"{printable(of)}: {note}")
+            for note in untold(notes, self._told):
+                reporting.message(f"{printable(of)}: {note}")
 
     def sensor(self) -> SensorModel | None:
         """Return the sensor of the data set, unless it may have several or the file that names it is no sensor's."""

@@ -17,7 +17,7 @@ from lidargrit.scans.fit_sensor.elevations import FittedRows, cluster_rows, near
 from lidargrit.scans.fit_sensor.points import NOISE_RANGE_M, Points
 from lidargrit.scans.fit_sensor.rings import Method, Rings, recover_rings
 from lidargrit.scans.fit_sensor.setup import fit_setup
-from lidargrit.scans.many_scans import ManyScans, usable_scans
+from lidargrit.scans.many_scans import ManyScans, untold, usable_scans
 from lidargrit.scans.projection.frame import told_height
 from lidargrit.scans.projection.pixel_coordinates import row_elevation_rad
 from lidargrit.scans.projection.revolutions import told_revolutions
@@ -306,10 +306,10 @@ def _are_rows(rows: FittedRows) -> bool:
     return bool((rows.number == np.arange(len(rows.number))).all())
 
 
-def _notes_of(scans: Sequence[Scan]) -> dict[str, None]:
+def _notes_of(scans: Sequence[Scan]) -> list[str]:
     """Return what readers say of the files, each sentence once, and whether a scan has several revolutions."""
     turns = next((told for scan in scans if (told := told_revolutions(scan))), "")
-    return dict.fromkeys((*(note for scan in scans for note in scan.notes), *([turns] if turns else [])))
+    return untold((*(note for scan in scans for note in scan.notes), *([turns] if turns else [])), set())
 
 
 def _warnings(rows: FittedRows, rings: Rings, num_scans: int, columns: int | None) -> tuple[str, ...]:
