@@ -65,6 +65,10 @@ class LibraryDataset(FileDataset):
         path, number = self._scans[index]
         return f"{self.sequence_of(path.relative_to(self.root))}#{number}"
 
+    def within(self, index: int) -> str:
+        """Return which scan of its drive a scan is."""
+        return f"#{self._scans[index][1]}"
+
     @classmethod
     def scans_in(cls, path: Path, topic: str = "") -> int:
         """Count the scans of a drive's first LiDAR."""
