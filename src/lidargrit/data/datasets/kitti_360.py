@@ -8,11 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from lidargrit.core.errors import DataError
-from lidargrit.core.files import read_text
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset
-from lidargrit.data.datasets.shared.odometry import table
+from lidargrit.data.datasets.shared.odometry import calibrated, table
 from lidargrit.data.datasets.shared.poses_beside import time_beside
 from lidargrit.scans.motion import Motion
 
@@ -106,15 +104,6 @@ def _poses(root: Path, drive: str) -> dict[int, Float64[np.ndarray, "4 4"]]:
     rows = table(root / "data_poses" / drive / "poses.txt", 13, "13 numbers in each row: a scan's number and its pose")
     if not len(rows) or not all(file.is_file() for file in files):
         return {}
-    try:
-        lines = [line.removeprefix(_CAMERA) for line in read_text(files[0]).splitlines() if line.startswith(_CAMERA)]
-        pose_from_camera, velo_from_camera = (
-            np.array([float(word) for word in text.split()]).reshape(3, 4) for text in (lines[0], read_text(files[1]))
-        )
-    except (ValueError, IndexError):
-        raise DataError(
-            f"{files[0].parent}, whose calibration is damaged", "3x4 numbers", "download it again"
-        ) from None
+    pose_from_velo = calibrated(files[0], _CAMERA) @ np.linalg.inv(calibrated(files[1]))
     last = np.array([[0.0, 0, 0, 1]])
-    pose_from_velo = np.vstack((pose_from_camera, last)) @ np.linalg.inv(np.vstack((velo_from_camera, last)))
     return {int(row[0]): np.vstack((row[1:].reshape(3, 4), last)) @ pose_from_velo for row in rows}

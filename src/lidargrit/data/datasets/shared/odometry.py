@@ -38,7 +38,8 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     cameras = table(own if own.exists() else beside, 12, _POSE).reshape(-1, 3, 4)
     poses = _homogeneous(cameras)
     if len(poses):
-        camera_from_sensor = _camera_from_sensor(sequence / "calib.txt")
+        calibration = sequence / "calib.txt"
+        camera_from_sensor = calibrated(calibration, "Tr:") if calibration.exists() else np.eye(4)
         poses = np.linalg.inv(camera_from_sensor) @ poses @ camera_from_sensor
     count = max(len(times_s), len(poses))
     return tuple(
@@ -50,13 +51,13 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     )
 
 
-def _camera_from_sensor(path: Path) -> Float64[np.ndarray, "4 4"]:
-    if not path.exists():
-        return np.eye(4)
-    rows = [line.removeprefix("Tr:") for line in _lines(path) if line.startswith("Tr:")]
-    found = _numbers(rows, 12, path, f"a row 'Tr:' with {_POSE}")
+def calibrated(path: Path, name: str = "") -> Float64[np.ndarray, "4 4"]:
+    """Return the matrix from one sensor to another in the row of a file that begins with a name, or in its only row."""
+    rows = [line.removeprefix(name) for line in _lines(path) if line.startswith(name) and line.strip()]
+    told = f" {name!r}" * bool(name)
+    found = _numbers(rows, 12, path, f"a row{told} with {_POSE}")
     if len(found) != 1 or abs(np.linalg.det(found.reshape(3, 4)[:, :3])) < 0.5:  # a rotation has 1
-        raise DataError(f"{path} without a pose 'Tr:'", "that of the sensor before the camera", "restore the file")
+        raise DataError(f"{path} without a pose{told}", "that of one sensor seen from another", "restore the file")
     return _homogeneous(found.reshape(1, 3, 4))[0]
 
 

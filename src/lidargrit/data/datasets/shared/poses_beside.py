@@ -66,6 +66,8 @@ def _timestamps_s(path: Path) -> Float64[np.ndarray, "n"]:
     try:
         rows = read_text(path).split("\n") if path.is_file() else []
         times = np.array([row.strip() for row in rows if row.strip()], dtype="datetime64[ns]")
+        if np.isnat(times).any():  # which NumPy reads as a time
+            raise ValueError
     except (ConfigError, ValueError):
         raise DataError(f"{path} with a row that is no time", wanted, "restore the file") from None
     return (times - times[:1]) / np.timedelta64(1, "s") if len(times) else np.zeros(0)
