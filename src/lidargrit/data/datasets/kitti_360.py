@@ -1,6 +1,5 @@
 """KITTI-360: ROOT/data_3d_raw/2013_05_28_drive_SSSS_sync/velodyne_points/data/*.bin → scans of 9 long drives."""
 
-from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -8,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from lidargrit.core.files import remembered
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset
 from lidargrit.data.datasets.shared.odometry import calibrated, table
@@ -92,7 +92,12 @@ class Kitti360(FileDataset):
         return f"{self.public_name()}/{_SAME_DRIVE.get(drive, drive)}"
 
 
-@lru_cache(maxsize=16)
+def _files_of(root: Path, drive: str) -> list[Path]:
+    calibration = [root / "calibration" / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
+    return [root / "data_poses" / drive / "poses.txt", *calibration]
+
+
+@remembered(_files_of, at_most=16)
 def _poses(root: Path, drive: str) -> dict[int, Float64[np.ndarray, "4 4"]]:
     """Return the pose of the sensor at each scan of a drive that has one, by its number; none without the files.
 
@@ -100,8 +105,8 @@ def _poses(root: Path, drive: str) -> dict[int, Float64[np.ndarray, "4 4"]]:
         KITTI-360's documentation: poses.txt is of the GPS and IMU, calib_cam_to_pose.txt leads from each camera there,
         and calib_cam_to_velo.txt from camera 0 to the sensor.
     """
-    files = [root / "calibration" / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
-    rows = table(root / "data_poses" / drive / "poses.txt", 13, "13 numbers in each row: a scan's number and its pose")
+    poses, *files = _files_of(root, drive)
+    rows = table(poses, 13, "13 numbers in each row: a scan's number and its pose")
     if not len(rows) or not all(file.is_file() for file in files):
         return {}
     pose_from_velo = calibrated(files[0], _CAMERA) @ np.linalg.inv(calibrated(files[1]))

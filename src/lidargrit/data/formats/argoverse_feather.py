@@ -1,7 +1,6 @@
 """Argoverse 2 .feather: the points of two VLP-32C ⇄ :class:`Scan` of one of them, with a ring per point."""
 
 import struct
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
 from lidargrit.core.errors import DataError, OutputError, ScanError
-from lidargrit.core.files import atomic_path
+from lidargrit.core.files import atomic_path, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
 from lidargrit.scans.point_times import point_times
 from lidargrit.scans.sensors import load_sensor
@@ -25,6 +24,7 @@ _COLUMNS = ("x", "y", "z", "intensity", "laser_number")
 _FORMAT = f"an Arrow feather file with the columns {', '.join(_COLUMNS)}"
 _CURE = "download it again, or convert it"
 _POSE_COLUMNS = ("qx", "qy", "qz", "qw", "tx_m", "ty_m", "tz_m")
+_ANY = "any.feather"  # for what is the same of all sweeps of a log
 _LENGTH_OFF = 0.01  # of a quaternion from 1
 _NAMES = ("up_lidar", "down_lidar")
 # The poses that the data set's own guide prints as its example, in the order of the columns above.
@@ -182,16 +182,22 @@ def sensor_poses(path: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
     Raises:
         DataError: the file is damaged, or that of the sensors' places in the car.
     """
-    poses = path.absolute().parents[2] / "city_SE3_egovehicle.feather"
-    return _sensor_poses(poses, path.absolute().parent) if poses.is_file() else {}
+    return _sensor_poses(path.absolute().parent)
 
 
-@lru_cache(maxsize=64)
-def _sensor_poses(poses: Path, sweeps: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
+def _pose_files(sweeps: Path) -> tuple[Path, ...]:
+    return sweeps.parents[1] / "city_SE3_egovehicle.feather", *ArgoverseFeather.sidecar_files(sweeps / _ANY)
+
+
+@remembered(_pose_files)
+def _sensor_poses(sweeps: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
+    poses, *_ = _pose_files(sweeps)
+    if not poses.is_file():
+        return {}
     try:
         data = read_bytes(poses, _FILE_BYTES_AT_MOST, "poses of the car")
         columns = _columns(poses, ("timestamp_ns", *_POSE_COLUMNS), data)
-        own = _pose(sweeps / "any.feather", _NAMES[0])
+        own = _pose(sweeps / _ANY, _NAMES[0])
     except ScanError as error:
         raise DataError(error.got, error.wanted, error.cure) from None
     numbers = np.stack([columns[name] for name in _POSE_COLUMNS], axis=1).astype(np.float64)
