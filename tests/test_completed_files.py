@@ -15,6 +15,8 @@ from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.formats.pcd import Pcd
 from lidargrit.data.prepared.config import ScanSettings
 from lidargrit.inference.complete import open_model
+from lidargrit.inference.complete.cloud import CompletedScan
+from lidargrit.inference.complete.clouds_to_files import write_cloud
 from lidargrit.inference.complete.tasks import complete_scan
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import load_sensor
@@ -173,3 +175,18 @@ def test_a_turned_or_mirrored_cloud_comes_back_whole(change):
     points = torch.stack((-y, x, z) if change == "turned" else (x, -y, z), 1)
     done = complete_scan(Scan(points, scan.reflectance), open_model("nearest", sensor=DENSE.fine()))
     assert torch.equal(done.whole().points_xyz_m[: len(points)], points)
+
+
+@pytest.mark.parametrize("ending", ["bin", "ply", "npy"])
+@pytest.mark.parametrize("added", [0, 3])
+def test_points_that_were_added_before_stay_marked(ending, added, tmp_path):
+    points = torch.from_numpy(np.random.default_rng(0).uniform(1, 9, (20, 3)).astype(np.float32))
+    earlier = torch.arange(20) >= 15
+    path, (form, *_) = tmp_path / f"a.{ending}", formats.candidates(tmp_path / f"a.{ending}")
+    form.write(path, Scan(points, torch.zeros(20), filled=earlier))
+    kept = torch.arange(20) % 4 > 0  # the others were dropped
+    done = CompletedScan(form.read(path), kept, Scan(points[:added], torch.zeros(added)) if added else None)
+    write_cloud(tmp_path / f"b.{ending}", "", done, form)
+    again = form.read(tmp_path / f"b.{ending}")
+    assert again.filled is not None
+    assert again.filled.tolist() == [*earlier[kept].tolist(), *[True] * added]

@@ -9,8 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from lidargrit.core.errors import DataError
-from lidargrit.data.datasets import ScanDataset, open_dataset
+from lidargrit.data.datasets import ScanDataset, load, open_dataset
 from lidargrit.data.datasets.shared.odometry import motions
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.prepare import prepare
 
 CORNER_M = np.array([12.0, 3.0, 1.0, 1.0])  # in the frame of the recording
 
@@ -100,6 +102,21 @@ def test_kitti_360_has_the_poses_of_its_car_and_the_calibration_of_its_sensor(tm
         assert np.allclose(pose.numpy() @ seen, CORNER_M, atol=1e-9)
 
 
+@pytest.mark.parametrize("row", [" ".join(["0"] * 12), " ".join(["nan"] * 12), "", "no numbers"])
+def test_a_damaged_calibration_of_kitti_360_is_refused(row, tmp_path):
+    name = "2013_05_28_drive_0003_sync"
+    scan_file(tmp_path / "data_3d_raw" / name / "velodyne_points" / "data" / "0000000000.bin")
+    for file, text in (
+        (f"data_poses/{name}/poses.txt", f"0 {rows(np.eye(4))}\n"),
+        ("calibration/calib_cam_to_pose.txt", f"image_00: {rows(np.eye(4))}\n"),
+        ("calibration/calib_cam_to_velo.txt", f"{row}\n"),
+    ):
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(text)
+    with pytest.raises(DataError, match=r"calib_cam_to_velo\.txt"):
+        open_dataset(f"kitti_360:{tmp_path}:all").motion(0)
+
+
 def test_nuscenes_has_poses_in_its_tables(tmp_path):
     log, poses, files = "n008-2018-08-01-15-16-36-0400", car_poses(2), []
     for number in range(2):
@@ -148,6 +165,23 @@ def test_argoverse_2_has_the_poses_of_its_car(tmp_path):
         assert np.allclose(seen, on_car - (1.350180, 0, 1.640420), atol=0.1)  # its axes are the car's to half a degree
 
 
+@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, np.nan), None])
+def test_damaged_poses_of_argoverse_2_are_refused_where_poses_are_needed(quaternion, tmp_path):
+    feather, arrow = pytest.importorskip("pyarrow.feather"), pytest.importorskip("pyarrow")
+    load("argoverse2").write_example(tmp_path, 1)
+    file = next((tmp_path / "train").iterdir()) / "city_SE3_egovehicle.feather"
+    if quaternion is None:
+        file.write_bytes(b"no poses")
+    else:
+        columns = dict(zip(("qx", "qy", "qz", "qw", "tx_m", "ty_m", "tz_m"), (*quaternion, 0, 0, 0), strict=True))
+        feather.write_feather(
+            arrow.table({"timestamp_ns": [0], **{key: [float(at)] for key, at in columns.items()}}), file
+        )
+    with pytest.raises(DataError, match=r"city_SE3_egovehicle\.feather"):
+        open_dataset(f"argoverse2:{tmp_path}:all").motion(0)
+    assert prepare(f"argoverse2:{tmp_path}:all", DataConfig(sensor="vlp32c"), tmp_path / "prepared").is_dir()
+
+
 def test_poses_without_a_calibration_are_the_sensors_own(tmp_path):
     (tmp_path / "poses.txt").write_text(f"{rows(np.eye(4))}\n")
     (tmp_path / "times.txt").write_text("0\n")
@@ -168,8 +202,11 @@ def test_poses_of_tums_form_beside_scans_are_told_once(tmp_path, heard):
     ]
 
 
-def test_damaged_timestamps_are_refused(tmp_path):
+@pytest.mark.parametrize("row", ["noon", "NaT"])
+def test_damaged_timestamps_are_refused(row, tmp_path):
     scan_file(tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "data" / "0000000000.bin")
-    (tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps.txt").write_text("noon\n")
+    (tmp_path / "2011_09_26" / "2011_09_26_drive_0001_sync" / "velodyne_points" / "timestamps.txt").write_text(
+        f"{row}\n"
+    )
     with pytest.raises(DataError, match=r"timestamps\.txt with a row that is no time"):
         open_dataset(f"kitti_raw:{tmp_path}:all").motion(0)

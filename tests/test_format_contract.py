@@ -107,6 +107,22 @@ def test_keeps_what_it_says_that_it_keeps(writer, tmp_path):
             assert torch.allclose(wanted.double(), got.double(), rtol=0, atol=0.003), name
 
 
+@pytest.mark.parametrize("ending", ["pcd", "ply", "csv"])
+@pytest.mark.parametrize("kind", ["<f2", ">f4", ">f8", ">u2", "<i8"])
+def test_keeps_columns_of_any_type_and_name(ending, kind, tmp_path):
+    """Those of a file in another format, of which a scan has room for none."""
+    points = np.random.default_rng(0).uniform(1, 9, (50, 3)).astype(np.float32)
+    times = (np.linspace(0, 100, 50) + (1_700_000_000_123_456_789 if kind == "<i8" else 0)).astype(kind)
+    path, (form, *_) = tmp_path / f"a.{ending}", candidates(tmp_path / f"a.{ending}")
+    form.write_columns(path, {"sensor id": times, **dict(zip("xyz", points.T, strict=True)), "time": times})
+    again = form.read(path)
+    assert np.array_equal(again.points_xyz_m.numpy(), points)
+    if kind != "<i8":
+        assert np.array_equal(again.rows.columns["time"].astype(kind), times)
+    elif ending == "csv":  # PLY has no whole numbers of 64 bits, and readers of text take doubles
+        assert f",{times[1]}\n" in path.read_text()
+
+
 def test_writes_a_scan_that_has_points_and_rings_only(writer, tmp_path):
     whole = example(writer)
     path = tmp_path / f"bare{writer.suffixes[0]}"

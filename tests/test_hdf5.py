@@ -14,6 +14,10 @@ from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.formats import count_scans, read_scan
 from lidargrit.data.formats.shared import hdf5_child
+from lidargrit.data.sources import open_source
+from lidargrit.scans.projection import project
+from lidargrit.scans.sensors import load_sensor
+from lidargrit.simulator import simulate
 from street_corner import corner, rows_of, xyz_of
 
 h5py = pytest.importorskip("h5py")
@@ -77,6 +81,17 @@ def test_datasets_are_named_and_can_be_chosen(tmp_path, capsys):
         read_scan(written(tmp_path / "b.h5", {"image": np.zeros((3, 4, 5))}))
     with pytest.raises(ScanError, match=r"scan number 1 of .*a\.h5"):
         read_scan(written(tmp_path / "a.h5", {"points": POINTS}), 1)
+
+
+def test_clouds_of_one_file_are_different_scans_when_they_are_prepared(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARGRIT_CACHE", str(tmp_path / "cache"))
+    scans = [simulate(seed=seed) for seed in range(2)]
+    path = written(tmp_path / "a.h5", {f"cloud_{at}": scan.points_xyz_m for at, scan in enumerate(scans)})
+    sensor = load_sensor("hdl64e_kitti_360").with_columns(128)
+    images = [open_source(f"{path}:/cloud_{at}").images(sensor) for at in range(2)]
+    for scan, one in zip(scans, images, strict=True):
+        assert torch.allclose(one.batch([0]).range_m[0], project(scan, sensor).range_m, atol=2e-3)
+    assert "in both" not in images[0].provenance.overlap(images[1].provenance)
 
 
 def test_hostile_files_give_nothing_away_and_take_no_room(tmp_path):

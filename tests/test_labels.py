@@ -254,3 +254,12 @@ def test_labels_of_dropped_points_are_dropped(bad, tmp_path):
         scan = dataset.scan(0)
         assert scan.label is not None
         assert scan.label.tolist() == [0, 1, 2, 3, 5, 6, 7, 8]
+
+
+def test_rows_that_are_padded_with_zeros_have_labels_too(tmp_path):
+    rows = np.zeros((9, 5), "<f4")
+    rows[:, :3] = np.random.default_rng(0).uniform(0.1, 1, (9, 3))
+    for name, data in (("velodyne/000000.bin", rows), ("labels/000000.label", np.arange(9, dtype="<u4"))):
+        (tmp_path / "sequences/00" / name).parent.mkdir(parents=True)
+        (tmp_path / "sequences/00" / name).write_bytes(data.tobytes())
+    assert KittiOdometry(tmp_path).scan(0).label.tolist() == list(range(9))

@@ -2,7 +2,6 @@
 
 import time
 
-from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.data.drives import DriveConfig, write_drives
 from lidargrit.data.prepared.config import DataConfig, ScanSettings
 from lidargrit.viewer.interactive import page, write_page
@@ -18,7 +17,6 @@ def test_times_of_a_drive_are_on_the_page(tmp_path, heard):
     (later,) = load_scan_sets([f"kitti_odometry:{tmp_path}:00[34%:]"], 2, settings=settings)
     assert [scan["time"] for scan in page_data(page([later]))["sources"][0]["scans"]] == [0, 0.1]
     (tmp_path / "sequences" / "00" / "times.txt").write_text("noon\n")
-    motions.cache_clear()
     (none,) = load_scan_sets([f"kitti_odometry:{tmp_path}"], 2, settings=settings)
     assert none.times_s == ()
     assert any("times are not known: got a row of" in line for line in heard)

@@ -33,6 +33,14 @@ def test_times_are_seconds_whatever_a_driver_calls_them(name, column):
     np.testing.assert_allclose(scan.point_time_s - scan.point_time_s[0], SINCE_S, atol=2e-6)
 
 
+@pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int16, np.uint16, np.uint64])
+def test_numbers_of_few_bits_are_times_too(kind):
+    milliseconds = (SINCE_S * 1e3).round().astype(kind)
+    since_s = _scan(time=milliseconds).point_time_s
+    assert since_s is not None
+    np.testing.assert_allclose(since_s, milliseconds / 1e3)
+
+
 def test_another_unit_than_the_usual_is_told():
     assert any("milliseconds" in note for note in _scan(time=SINCE_S * 1e3).notes)
     assert not any("time" in note for note in _scan(time=SINCE_S).notes)

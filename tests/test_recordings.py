@@ -1,6 +1,7 @@
 """Drives as recordings: read back by our reader, by the library of ROS messages, and by rerun where it is installed."""
 
 import json
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from lidargrit.cli import main
-from lidargrit.core.errors import DataError, OutputError
+from lidargrit.core.errors import DataError, OutputError, ScanError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.export import export_scans
 from lidargrit.data.formats import count_scans, read_scan
@@ -104,6 +105,15 @@ def test_unusable_scans_are_left_out_of_a_recording(drives, tmp_path):
     (tmp_path / "in/sequences/00/velodyne/000000.bin").unlink()
     with pytest.raises(DataError, match="got no usable scan"):
         export_scans(f"kitti_odometry:{tmp_path / 'in'}", tmp_path / "none", "mcap", skipping)
+
+
+@pytest.mark.parametrize("times_s", [(-0.2, -0.1), (1.5e15, 1.5e15 + 1e5)], ids=["before 0", "microseconds"])
+def test_times_that_no_recording_holds_are_refused(drives, times_s, tmp_path):
+    pytest.importorskip("mcap")
+    copytree(drives / "sequences/08", tmp_path / "in/sequences/08")
+    (tmp_path / "in/sequences/08/times.txt").write_text("".join(f"{time_s!r}\n" for time_s in times_s))
+    with pytest.raises(ScanError, match=f"a time of {times_s[0]:g} s of .*000000".replace("+", r"\+")):
+        export_scans(f"kitti_odometry:{tmp_path / 'in'}", tmp_path / "out", "mcap")
 
 
 def test_a_missing_library_is_told_in_one_line(drives, tmp_path, monkeypatch):

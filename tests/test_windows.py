@@ -86,3 +86,16 @@ def test_a_damaged_file_of_times_or_poses_is_refused_where_it_is_needed(file, co
     assert len(scans.scan(0)) > 0
     with pytest.raises(DataError, match=message):
         scans.windows(1)
+
+
+def test_scans_and_times_that_are_added_to_a_drive_are_read(tmp_path):
+    for count in (2, 3):
+        write_drives(tmp_path, count, DriveConfig(SENSOR, seed=2_000_001, frames=3))
+        (window,) = open_dataset(f"kitti_odometry:{tmp_path}").windows(count)
+        assert len(window.indices) == count
+        scan = tmp_path / f"raw/d/velodyne_points/data/{count - 2:010d}.bin"
+        scan.parent.mkdir(parents=True, exist_ok=True)
+        scan.write_bytes((tmp_path / "sequences/00/velodyne/000000.bin").read_bytes())
+        times = "".join(f"2011-09-26 13:02:2{number}\n" for number in range(count - 1))
+        (scan.parents[1] / "timestamps.txt").write_text(times)
+        assert open_dataset(f"{tmp_path / 'raw'}").motion(count - 2).time_s == count - 2

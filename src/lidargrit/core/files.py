@@ -9,17 +9,21 @@ import secrets
 import socket
 import stat
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import lru_cache, wraps
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from lidargrit.core.errors import CheckpointError, ConfigError, HeldError, LidarGritError, OutputError, one_of
 from lidargrit.core.untrusted import JSON_BYTES_AT_MOST, TEXT_BYTES_AT_MOST, parse_json
 
 if TYPE_CHECKING:  # quick start of commands that only read and write JSON
     from torch import Tensor
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
 
 _PARTIALS = f".lidargrit-partial-{os.getuid()}"  # one a user: a shared folder such as /tmp has files of many
 _ATTEMPTS = 1000  # to make a file that others may sweep away; some file systems can make none, and say so each time
@@ -202,6 +206,30 @@ def state_of(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_size, status.st_mtime_ns
+
+
+def remembered(
+    files_of: Callable[..., Iterable[Path]], at_most: int = 64
+) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+    """Return a decorator of functions that read files: what was read is kept until one of the files changes.
+
+    Args:
+        files_of: function of the same arguments that names the files and folders; they need not be there.
+        at_most: number of results that are kept.
+    """
+
+    def of_function(read: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+        @lru_cache(at_most)
+        def known(_states: tuple[object, ...], *args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+            return read(*args, **kwargs)
+
+        @wraps(read)
+        def read_if_changed(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+            return known(tuple(map(state_of, files_of(*args, **kwargs))), *args, **kwargs)
+
+        return read_if_changed
+
+    return of_function
 
 
 def is_taken(folder: Path) -> bool:

@@ -40,13 +40,13 @@ def point_times(
     for name in TIME_NAMES:
         if name not in named or not good.any():
             continue
-        values = named[name]
+        values = named[name].astype(f"{named[name].dtype.kind}8")  # units are larger than what fewer bits hold
         known = values[good.numpy()]
         if not np.isfinite(known).all() or not (known != known[0]).any():
             continue
         whole = values.dtype.kind in "iu"
         # Nanoseconds since 1970 take more digits than a double has; what was whole is divided as such.
-        lasted = float(known.max() - known.min())
+        lasted = known.max().item() - known.min().item()
         units = _OF_WHOLE_NUMBERS if whole else _OF_FRACTIONS
         usual, fitting = units[0], [unit for unit in units if _TURN_S[0] <= lasted * unit <= _TURN_S[1]]
         unit = fitting[0] if fitting and usual not in fitting else usual

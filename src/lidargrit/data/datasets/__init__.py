@@ -112,6 +112,10 @@ class ScanDataset(ABC):
     def name(self, index: int) -> str:
         """Name one scan, the same on every machine and in every split: "00/000012"."""
 
+    def within(self, index: int) -> str:
+        """Return which scan of its file a scan is, by topic and number; "" where it is the only one."""
+        return ""
+
     def recording(self, index: int) -> str:
         """Name the recording that a scan was cut from, the same in every data set that has it; "" if it is alone."""
         return ""

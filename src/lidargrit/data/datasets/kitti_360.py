@@ -1,6 +1,5 @@
 """KITTI-360: ROOT/data_3d_raw/2013_05_28_drive_SSSS_sync/velodyne_points/data/*.bin → scans of 9 long drives."""
 
-from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
@@ -8,11 +7,10 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from lidargrit.core.errors import DataError
-from lidargrit.core.files import read_text
+from lidargrit.core.files import remembered
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset
-from lidargrit.data.datasets.shared.odometry import table
+from lidargrit.data.datasets.shared.odometry import calibrated, table
 from lidargrit.data.datasets.shared.poses_beside import time_beside
 from lidargrit.scans.motion import Motion
 
@@ -94,7 +92,12 @@ class Kitti360(FileDataset):
         return f"{self.public_name()}/{_SAME_DRIVE.get(drive, drive)}"
 
 
-@lru_cache(maxsize=16)
+def _files_of(root: Path, drive: str) -> list[Path]:
+    calibration = [root / "calibration" / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
+    return [root / "data_poses" / drive / "poses.txt", *calibration]
+
+
+@remembered(_files_of, at_most=16)
 def _poses(root: Path, drive: str) -> dict[int, Float64[np.ndarray, "4 4"]]:
     """Return the pose of the sensor at each scan of a drive that has one, by its number; none without the files.
 
@@ -102,19 +105,10 @@ def _poses(root: Path, drive: str) -> dict[int, Float64[np.ndarray, "4 4"]]:
         KITTI-360's documentation: poses.txt is of the GPS and IMU, calib_cam_to_pose.txt leads from each camera there,
         and calib_cam_to_velo.txt from camera 0 to the sensor.
     """
-    files = [root / "calibration" / name for name in ("calib_cam_to_pose.txt", "calib_cam_to_velo.txt")]
-    rows = table(root / "data_poses" / drive / "poses.txt", 13, "13 numbers in each row: a scan's number and its pose")
+    poses, *files = _files_of(root, drive)
+    rows = table(poses, 13, "13 numbers in each row: a scan's number and its pose")
     if not len(rows) or not all(file.is_file() for file in files):
         return {}
-    try:
-        lines = [line.removeprefix(_CAMERA) for line in read_text(files[0]).splitlines() if line.startswith(_CAMERA)]
-        pose_from_camera, velo_from_camera = (
-            np.array([float(word) for word in text.split()]).reshape(3, 4) for text in (lines[0], read_text(files[1]))
-        )
-    except (ValueError, IndexError):
-        raise DataError(
-            f"{files[0].parent}, whose calibration is damaged", "3x4 numbers", "download it again"
-        ) from None
+    pose_from_velo = calibrated(files[0], _CAMERA) @ np.linalg.inv(calibrated(files[1]))
     last = np.array([[0.0, 0, 0, 1]])
-    pose_from_velo = np.vstack((pose_from_camera, last)) @ np.linalg.inv(np.vstack((velo_from_camera, last)))
     return {int(row[0]): np.vstack((row[1:].reshape(3, 4), last)) @ pose_from_velo for row in rows}

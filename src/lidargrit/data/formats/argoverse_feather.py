@@ -1,7 +1,6 @@
 """Argoverse 2 .feather: the points of two VLP-32C ⇄ :class:`Scan` of one of them, with a ring per point."""
 
 import struct
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,8 @@ import torch
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from lidargrit.core.errors import OutputError, ScanError
-from lidargrit.core.files import atomic_path
+from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.core.files import atomic_path, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
 from lidargrit.scans.point_times import point_times
 from lidargrit.scans.sensors import load_sensor
@@ -25,6 +24,8 @@ _COLUMNS = ("x", "y", "z", "intensity", "laser_number")
 _FORMAT = f"an Arrow feather file with the columns {', '.join(_COLUMNS)}"
 _CURE = "download it again, or convert it"
 _POSE_COLUMNS = ("qx", "qy", "qz", "qw", "tx_m", "ty_m", "tz_m")
+_ANY = "any.feather"  # for what is the same of all sweeps of a log
+_LENGTH_OFF = 0.01  # of a quaternion from 1
 _NAMES = ("up_lidar", "down_lidar")
 # The poses that the data set's own guide prints as its example, in the order of the columns above.
 _NOMINAL = {
@@ -166,8 +167,8 @@ def _pose(path: Path, name: str) -> tuple[Float64[np.ndarray, "3 3"], Float64[np
     columns = _columns(calibration, ("sensor_name", *_POSE_COLUMNS), data)
     rows = np.flatnonzero(columns["sensor_name"] == name)
     pose = [float(columns[column][rows[0]]) for column in _POSE_COLUMNS] if len(rows) else [0.0]
-    level = np.isfinite(pose).all() and 0.99 < np.linalg.norm(pose[:4]) < 1.01 and abs(_up(pose)[2]) > 0.5
-    if not level:
+    is_unit = np.isfinite(pose).all() and abs(np.linalg.norm(pose[:4]) - 1) < _LENGTH_OFF
+    if not (is_unit and abs(_up(pose)[2]) > 0.5):
         raise ScanError(f"no pose of {name} on a car in {calibration}", f"{wanted}, with a unit quaternion", _CURE)
     return _axes_and_origin(pose)
 
@@ -177,18 +178,34 @@ def sensor_poses(path: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
 
     Args:
         path: sweep of the log.
+
+    Raises:
+        DataError: the file is damaged, or that of the sensors' places in the car.
     """
-    poses = path.absolute().parents[2] / "city_SE3_egovehicle.feather"
-    return _sensor_poses(poses, path.absolute().parent) if poses.is_file() else {}
+    return _sensor_poses(path.absolute().parent)
 
 
-@lru_cache(maxsize=64)
-def _sensor_poses(poses: Path, sweeps: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
-    data = read_bytes(poses, _FILE_BYTES_AT_MOST, "poses of the car")
-    columns = _columns(poses, ("timestamp_ns", *_POSE_COLUMNS), data)
+def _pose_files(sweeps: Path) -> tuple[Path, ...]:
+    return sweeps.parents[1] / "city_SE3_egovehicle.feather", *ArgoverseFeather.sidecar_files(sweeps / _ANY)
+
+
+@remembered(_pose_files)
+def _sensor_poses(sweeps: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
+    poses, *_ = _pose_files(sweeps)
+    if not poses.is_file():
+        return {}
+    try:
+        data = read_bytes(poses, _FILE_BYTES_AT_MOST, "poses of the car")
+        columns = _columns(poses, ("timestamp_ns", *_POSE_COLUMNS), data)
+        own = _pose(sweeps / _ANY, _NAMES[0])
+    except ScanError as error:
+        raise DataError(error.got, error.wanted, error.cure) from None
     numbers = np.stack([columns[name] for name in _POSE_COLUMNS], axis=1).astype(np.float64)
+    lengths = np.linalg.norm(numbers[:, :4], axis=1)
+    if not (np.isfinite(numbers).all() and bool((np.abs(lengths - 1) < _LENGTH_OFF).all())):
+        raise DataError(f"{poses}, with a pose that is none", "unit quaternions and places in metres", _CURE)
     car_from_sensor, found = np.eye(4), np.tile(np.eye(4), (len(numbers), 1, 1))
-    car_from_sensor[:3, :3], car_from_sensor[:3, 3] = _pose(sweeps / "any.feather", _NAMES[0])
+    car_from_sensor[:3, :3], car_from_sensor[:3, 3] = own
     found[:, :3, :3], found[:, :3, 3] = Rotation.from_quat(numbers[:, :4]).as_matrix(), numbers[:, 4:]
     return dict(zip(columns["timestamp_ns"].tolist(), found @ car_from_sensor, strict=True))
 

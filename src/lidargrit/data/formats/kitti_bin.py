@@ -53,7 +53,9 @@ class KittiBin(BareRowFormat):
         """Read the scan in a file."""
         data = read_bytes(path, POINTS_AT_MOST * _PADDED_BYTES, _FORMAT)
         if _is_padded(data, len(data)):
-            return scan_of(whole_rows(data, path, 5, _FORMAT)[:, :3], None, None, str(path), bad_points)
+            padded = whole_rows(data, path, 5, _FORMAT)
+            rows = rows_of(_COLUMNS, padded[:, :4])
+            return scan_of(padded[:, :3], None, None, str(path), bad_points, rows=rows)
         if width := wide_row(np.frombuffer(data, "<f4", min(len(data) // 4, 4 * _ROWS_TO_LOOK_AT))):
             nuscenes = "if nuScenes wrote it, name it .pcd.bin; else " if width == 5 else ""
             cure = f"{nuscenes}keep x, y, z and reflectance from 0 to 1, or save named columns as .npz"

@@ -1,9 +1,7 @@
 """Ouster .pcap with its .json of the same name: packets of any Ouster sensor → :class:`Scan` with a ring per point."""
 
-import functools
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ import numpy as np
 import torch
 
 from lidargrit.core.errors import ScanError
-from lidargrit.core.files import read_json
+from lidargrit.core.files import read_json, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, open_file, scan_of
 from lidargrit.data.formats.shared.packets import PCAP, PCAPNG, check_packets, other_maker
 from lidargrit.scans.sensors import SensorModel, column_azimuths_rad, load_sensor
@@ -126,22 +124,11 @@ def sensor_of(path: Path) -> SensorModel:
         raise ScanError(f"{metadata}, which is no metadata of an Ouster sensor ({what})", _FORMAT, _CURE) from None
 
 
+@remembered(lambda path: [path, path.with_suffix(".json")], at_most=2)
 def _open(path: Path) -> tuple[Any, Any, float, np.ndarray]:
     """Return the revolutions of a recording, what turns one into points, and the height of the beams over the base."""
-    recorded, metadata = _state_of(path), _metadata_of(path)
-    return _open_once(path, metadata, (recorded, _state_of(metadata)))
-
-
-def _state_of(path: Path) -> tuple[int, int]:
-    with open_file(path, _FORMAT) as file:
-        stat = os.fstat(file.fileno())
-    return stat.st_size, stat.st_mtime_ns
-
-
-@functools.lru_cache(maxsize=2)
-def _open_once(
-    path: Path, metadata: Path, states: tuple[tuple[int, int], tuple[int, int]]
-) -> tuple[Any, Any, float, np.ndarray]:
+    open_file(path, _FORMAT).close()
+    metadata = _metadata_of(path)
     if not OusterPcap.recognises(path):
         raise ScanError(f"{path}, which is no recording of packets", _FORMAT, _CURE)
     text = json.dumps(_read_json(metadata))

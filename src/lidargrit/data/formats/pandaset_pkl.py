@@ -3,7 +3,6 @@
 import gzip
 import zlib
 from dataclasses import replace
-from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from lidargrit.core.errors import DataError, ScanError
-from lidargrit.core.files import read_json
+from lidargrit.core.files import read_json, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, read_bytes
 from lidargrit.data.formats.shared.pandas_pickle import columns_of_table
 from lidargrit.scans.columns import ScanParts, usable_parts
@@ -23,6 +22,7 @@ from lidargrit.scans.types import Scan
 _FORMAT = "a frame of PandaSet as it is published: lidar/NN.pkl.gz beside poses.json and timestamps.json"
 _FILE_BYTES_AT_MOST, _UNPACKED_BYTES_AT_MOST = 50_000_000, 64_000_000  # a frame has 4 MB, unpacked 8
 _COLUMNS = ("x", "y", "z", "i", "t", "d")
+_POSES = ("poses.json", "timestamps.json")
 _TURNING = 0  # of the column d; 1 is the PandarGT, which looks ahead
 # Place and tilt of the Pandar64 in the axes of lidar/poses.json, x to the right and y ahead, which PandaSet does not
 # give: fitted to two of its drives, so that rows lie on the sensor's elevations. They agree to 4 mm and 0.02 degrees.
@@ -90,7 +90,7 @@ class PandasetPkl(ScanFormat):
     @staticmethod
     def sidecar_files(path: Path) -> tuple[Path, ...]:
         """Return the poses and times of the drive, and the labels of the frame."""
-        return (path.with_name("poses.json"), path.with_name("timestamps.json"), _labels_of(path))
+        return (*map(path.with_name, _POSES), _labels_of(path))
 
 
 def sensor_poses(folder: Path) -> Trajectory:
@@ -136,12 +136,11 @@ def _drive(path: Path) -> tuple[Trajectory, int]:
     return drive, int(number)
 
 
-@lru_cache(maxsize=16)
+@remembered(lambda folder: [folder / name for name in _POSES], at_most=16)
 def _trajectory(folder: Path) -> Trajectory:
     cure, source = "download the drive again, and keep its files together", str(folder / "poses.json")
     try:
-        names = ("poses.json", "timestamps.json")
-        poses, times = (read_json(folder / name, list, DataError, _FORMAT, cure) for name in names)
+        poses, times = (read_json(folder / name, list, DataError, _FORMAT, cure) for name in _POSES)
         turns = Rotation.from_quat([[float(one["heading"][key]) for key in "xyzw"] for one in poses]).as_matrix()
         matrices = np.tile(np.eye(4), (len(poses), 1, 1))
         matrices[:, :3, :3] = turns

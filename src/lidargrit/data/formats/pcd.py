@@ -14,6 +14,7 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
     begins_as,
+    one_word,
     scan_of_columns,
     text_rows,
     whole_number,
@@ -61,6 +62,7 @@ class Pcd(ColumnFormat):
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new binary file."""
+        columns = {one_word(name): _as_written(values) for name, values in columns.items()}
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
         kinds = {"f": "F", "u": "U", "i": "I"}
         lines = {
@@ -78,6 +80,11 @@ class Pcd(ColumnFormat):
         header = "".join(f"{key} {words}\n" for key, words in lines.items())
         with atomic_path(path) as temporary:
             temporary.write_bytes(header.encode() + rows.tobytes())
+
+
+def _as_written(values: np.ndarray) -> np.ndarray:
+    """Return numbers in a type and in the byte order that such files have."""
+    return values.astype("<f4" if values.dtype.str[1:] == "f2" else values.dtype.newbyteorder("<"))
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO, Protocol, runtime_checkable
 from urllib.parse import quote
 
 from lidargrit.core.errors import ScanError, printable
+from lidargrit.core.files import remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, open_file
 from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, REFLECTANCE_RULE, scan_of_columns
 from lidargrit.data.formats.shared.mcap import (
@@ -103,9 +104,8 @@ def _open(path: Path, topic: str) -> _Recording:
     if kind is None:
         raise ScanError(f"{path}, which is no recording", _FORMAT, "check what wrote it")
     try:
-        status = path.stat()
         with warnings.catch_warnings(action="ignore"):  # of what a library will drop
-            recording = _opened(kind, path, (status.st_size, status.st_mtime_ns), topic)
+            recording = _opened(kind, path, topic)
     except ImportError as error:
         raise ScanError(f"{path}, which takes {error.name or 'rosbags'} to read", "it installed", _INSTALL) from None
     except ScanError:
@@ -117,8 +117,8 @@ def _open(path: Path, topic: str) -> _Recording:
     return recording
 
 
-@functools.lru_cache(maxsize=4)
-def _opened(kind: str, path: Path, _version: tuple[int, int], topic: str) -> _Recording:
+@remembered(lambda kind, path, topic: [path], at_most=4)
+def _opened(kind: str, path: Path, topic: str) -> _Recording:
     return {".bag": _Ros1, ".mcap": _Mcap, ".db3": _Sqlite}[kind](path, topic)
 
 

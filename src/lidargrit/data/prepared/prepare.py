@@ -181,11 +181,7 @@ def _spec(
         state = None if path is None else state_of(path)
         if path is not None and state is None and config.bad_scans == "refuse":  # else left out when it is read
             raise DataError(f"{path}, which cannot be read", "files that are there", "remove the link")
-        name = (
-            dataset.name(index)
-            if path is None
-            else "".join((str(path.resolve()), *dataset.name(index).partition("#")[1:]))
-        )
+        name = dataset.name(index) if path is None else f"{path.resolve()}{dataset.within(index)}"
         scans.append((name, dataset.recording(index), *(state or (0, 0)), *_time_and_pose(dataset, index)))
         known = ((other.name, state_of(other)) for other in dataset.sidecar_files(index))
         beside += [(other, *state) for other, state in known if state]

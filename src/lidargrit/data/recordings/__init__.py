@@ -4,12 +4,13 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 
-from lidargrit.core.errors import OutputError
+from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.core.files import atomic_path
 from lidargrit.scans.types import Scan
 
 KINDS = ("mcap", "rrd")
 """Endings of the files, and names of the modules that write them."""
+_SECONDS_END = 2**31  # of a stamp of ROS, in 2038
 _FRAME_S = 0.1  # between scans whose times are not known: most lidars turn ten times a second
 
 
@@ -46,4 +47,7 @@ def _timed(scans: Iterable[Scan]) -> Iterator[tuple[float, Scan]]:
     time_s = -_FRAME_S
     for scan in scans:
         time_s = time_s + _FRAME_S if scan.time_s is None else scan.time_s
+        if not 0 <= time_s < _SECONDS_END:
+            got, wanted = f"a time of {time_s:g} s of {scan.source}", "seconds from 0 on, or since 1970"
+            raise ScanError(got, wanted, "correct times.txt, or whatever tells its times")
         yield time_s, scan

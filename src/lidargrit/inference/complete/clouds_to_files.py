@@ -69,8 +69,12 @@ def _rows_of_file(done: CompletedScan, rows: FileRows, form: type[ScanFormat]) -
     stays = np.ones(len(next(iter(rows.columns.values()))), dtype=bool)
     stays[rows.of_point[~done.kept.numpy()]] = False
     kept = {name: values[stays] for name, values in rows.columns.items()}
+    marks = np.zeros(len(stays), dtype=np.uint8)
+    if done.scan.filled is not None:  # which may lie beside the file, and not in its rows
+        marks[rows.of_point] = done.scan.filled.numpy()
     if done.filled is None:
-        return kept
+        needs_none = done.scan.filled is None or "filled" in map(quantity_of, kept)
+        return kept if needs_none else {**kept, "filled": marks[stays]}
     axes, nearest = form.columns_of(done.filled), rows.of_point[done.nearest_kept()]
     joined = {}
     for name, values in rows.columns.items():
@@ -79,8 +83,7 @@ def _rows_of_file(done: CompletedScan, rows: FileRows, form: type[ScanFormat]) -
         axis = axes.get(quantity_of(name)) if quantity_of(name) in _AXES else None
         added = _as_in_file(name, values, rows, done) if axis is None else axis
         joined[name] = _joined(kept[name], values[nearest] if added is None else added)
-    marks = next((values for name, values in kept.items() if quantity_of(name) == "filled"), np.zeros(stays.sum()))
-    return {**joined, "filled": _joined(marks.astype(np.uint8), np.ones(len(done.filled)))}
+    return {**joined, "filled": _joined(marks[stays], np.ones(len(done.filled)))}
 
 
 def _more_columns(done: CompletedScan) -> dict[str, np.ndarray]:

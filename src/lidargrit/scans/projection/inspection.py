@@ -49,7 +49,7 @@ class Inspection:
     Args:
         scan: scan that was projected.
         method: projection method, ``spherical`` or ``unfolding``.
-        variant: variant of the projection, ``exact`` or ``reference``.
+        variant: variant of the projection, as of :func:`project`.
         fate: index into FATES (n,) of every point.
         range_m: range image (H, W) in metres, 0 where there is no return.
         points_per_pixel: number of points (H, W) that fall into each pixel.
@@ -181,19 +181,18 @@ def _fates(
 ) -> tuple[Int8[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Return the fate of every point, and which points fall into a pixel of the image."""
     in_rows, in_limits = pixels.in_rows(), within_limits(pixels.range_m, sensor)
-    # The reference applies the limits to the winners only, and strictly.
     eligible = in_rows & in_limits if variant == "exact" else np.ones_like(in_rows)
     winner, _ = pixels.nearest(eligible)
     wanted = eligible & (pixels.column % sensor.column_stride == 0)
     fate = np.full(len(pixels.row), _HIDDEN, dtype=np.int8)
     fate[winner[winner >= 0]] = _KEPT
-    if variant == "reference":
-        fate[(fate == _KEPT) & (pixels.range_m <= sensor.range_min_m)] = _NEARER
-        fate[(fate == _KEPT) & (pixels.range_m >= sensor.range_max_m)] = _FARTHER
     fate[eligible & ~wanted] = _LEFT_OUT
+    # Programs apply the limits to the winners only, and the reference strictly.
+    under, over = (np.less_equal, np.greater_equal) if variant == "reference" else (np.less, np.greater)
+    decided = fate == _KEPT if variant != "exact" else np.ones_like(in_rows)
+    fate[decided & under(pixels.range_m, sensor.range_min_m)] = _NEARER
+    fate[decided & over(pixels.range_m, sensor.range_max_m)] = _FARTHER
     if variant == "exact":
-        fate[pixels.range_m < sensor.range_min_m] = _NEARER
-        fate[pixels.range_m > sensor.range_max_m] = _FARTHER
         fate[pixels.row < 0] = _ABOVE
         fate[pixels.row >= pixels.height] = _BELOW
     return fate, wanted

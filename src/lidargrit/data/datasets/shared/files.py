@@ -118,6 +118,12 @@ class FileDataset(ScanDataset):
         name += f"#{index_in_file}" if path in self._several else ""
         return name if sequence == "." else f"{sequence}/{name}"
 
+    def within(self, index: int) -> str:
+        """Return which scan of its file a scan is, by topic and number; "" where it is the only one."""
+        path, index_in_file = self._scans[index]
+        topic = f"@{self.topic}" if self.topic else ""
+        return f"{topic}#{index_in_file}" if path in self._several else topic
+
     def path(self, index: int) -> Path:
         """Return the file that holds a scan."""
         return self._scans[index][0]

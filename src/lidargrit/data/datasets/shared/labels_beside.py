@@ -9,7 +9,6 @@ import torch
 from lidargrit.core.errors import ScanError
 from lidargrit.data.formats import read_bytes
 from lidargrit.scans.classes import notes_on_labels
-from lidargrit.scans.columns import usable_points
 from lidargrit.scans.types import Scan
 
 _LABEL_BYTES = 4  # uint32: class in the lower 16 bits, instance in the upper
@@ -36,16 +35,15 @@ def with_labels(scan: Scan, path: Path) -> Scan:
     """
     if not (labels := label_file(path)).is_file():
         return scan
-    data = np.frombuffer(read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS), dtype=np.uint8)
-    rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
-    if len(data) != _LABEL_BYTES * len(rows):
+    assert scan.rows is not None  # as of all files of KITTI's format
+    data = read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS)
+    count = len(scan.rows.columns["x"])
+    if len(data) != _LABEL_BYTES * count:
         raise ScanError(
-            f"{len(data)} bytes of labels in {labels}, and {len(rows)} points in {path}",
-            f"{_LABELS}: {_LABEL_BYTES * len(rows)} bytes",
+            f"{len(data)} bytes of labels in {labels}, and {count} points in {path}",
+            f"{_LABELS}: {_LABEL_BYTES * count} bytes",
             "download both again, or move the labels away",
         )
-    label = torch.from_numpy(data.view("<u4").astype(np.int64))
-    if len(scan) != len(label):  # points were dropped, and their labels go with them
-        points = torch.from_numpy(rows)
-        label = label[usable_points(points[:, :3], points[:, 3])]
+    # Where points were dropped, their labels go with them.
+    label = torch.from_numpy(np.frombuffer(data, "<u4").astype(np.int64)[scan.rows.of_point])
     return replace(scan, label=label, notes=(*scan.notes, *notes_on_labels(label)))

@@ -1,11 +1,11 @@
 """What data sets share that a library of their makers reads: a folder of drives → scans of the first LiDAR of each."""
 
 from abc import abstractmethod
-from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
 from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.core.files import remembered
 from lidargrit.data.datasets.shared.files import FileDataset, hashed_name
 from lidargrit.data.formats import BadPoints
 from lidargrit.scans.motion import Motion
@@ -45,7 +45,7 @@ class LibraryDataset(FileDataset):
     @classmethod
     def _opened(cls, path: Path) -> Drive:
         try:
-            return _opened_once(cls, path, path.stat().st_mtime_ns)
+            return _opened_once(cls, path)
         except ImportError:
             cure = f"pip install 'lidargrit[{cls.public_name()}]', in an environment of its own"
             raise DataError(f"{path}, which takes {cls.library} to read", "it installed", cure) from None
@@ -64,6 +64,10 @@ class LibraryDataset(FileDataset):
         """Name one scan by its drive and its number there."""
         path, number = self._scans[index]
         return f"{self.sequence_of(path.relative_to(self.root))}#{number}"
+
+    def within(self, index: int) -> str:
+        """Return which scan of its drive a scan is."""
+        return f"#{self._scans[index][1]}"
 
     @classmethod
     def scans_in(cls, path: Path, topic: str = "") -> int:
@@ -105,6 +109,6 @@ class LibraryDataset(FileDataset):
         raise OutputError(f"an example of {cls.title}", "a layout that can be written", "take another")
 
 
-@lru_cache(maxsize=2)  # scans are read drive by drive
-def _opened_once(cls: type[LibraryDataset], path: Path, changed_ns: int) -> Drive:
+@remembered(lambda cls, path: [path], at_most=2)  # scans are read drive by drive
+def _opened_once(cls: type[LibraryDataset], path: Path) -> Drive:
     return cls.open_drive(path)

@@ -1,7 +1,6 @@
 """The files of one KITTI sequence, ``times.txt``, ``poses.txt``, ``calib.txt`` ⇄ when and where each scan was made."""
 
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import torch
 from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError, DataError
-from lidargrit.core.files import read_text, write_text
+from lidargrit.core.files import read_text, remembered, write_text
 from lidargrit.scans.motion import Motion
 
 # KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
@@ -17,7 +16,12 @@ _CAMERA_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0,
 _POSE = "12 finite numbers in each row, the first three rows of a pose"
 
 
-@lru_cache(maxsize=64)
+def _files_of(sequence: Path) -> list[Path]:
+    beside = sequence.parent.parent / "poses" / f"{sequence.name}.txt"  # as KITTI itself has them
+    return [*(sequence / name for name in ("times.txt", "calib.txt", "poses.txt")), beside]
+
+
+@remembered(_files_of)
 def motions(sequence: Path) -> tuple[Motion, ...]:
     """Return time and pose of every scan of a sequence, by the number of its file.
 
@@ -30,15 +34,14 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     Source:
         Geiger et al., CVPR 2012, readme.txt of the odometry benchmark's development kit.
     """
-    times_s = table(sequence / "times.txt", 1, "one finite number of seconds in each row")[:, 0]
+    times, calibration, own, beside = _files_of(sequence)
+    times_s = table(times, 1, "one finite number of seconds in each row")[:, 0]
     if bool((np.diff(times_s) <= 0).any()):
-        raise DataError(f"times that do not rise in {sequence / 'times.txt'}", "rising seconds", "restore the file")
-    beside = sequence.parent.parent / "poses" / f"{sequence.name}.txt"  # as KITTI itself has them
-    own = sequence / "poses.txt"
+        raise DataError(f"times that do not rise in {times}", "rising seconds", "restore the file")
     cameras = table(own if own.exists() else beside, 12, _POSE).reshape(-1, 3, 4)
     poses = _homogeneous(cameras)
     if len(poses):
-        camera_from_sensor = _camera_from_sensor(sequence / "calib.txt")
+        camera_from_sensor = calibrated(calibration, "Tr:") if calibration.exists() else np.eye(4)
         poses = np.linalg.inv(camera_from_sensor) @ poses @ camera_from_sensor
     count = max(len(times_s), len(poses))
     return tuple(
@@ -50,13 +53,13 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     )
 
 
-def _camera_from_sensor(path: Path) -> Float64[np.ndarray, "4 4"]:
-    if not path.exists():
-        return np.eye(4)
-    rows = [line.removeprefix("Tr:") for line in _lines(path) if line.startswith("Tr:")]
-    found = _numbers(rows, 12, path, f"a row 'Tr:' with {_POSE}")
+def calibrated(path: Path, name: str = "") -> Float64[np.ndarray, "4 4"]:
+    """Return the matrix from one sensor to another in the row of a file that begins with a name, or in its only row."""
+    rows = [line.removeprefix(name) for line in _lines(path) if line.startswith(name) and line.strip()]
+    told = f" {name!r}" * bool(name)
+    found = _numbers(rows, 12, path, f"a row{told} with {_POSE}")
     if len(found) != 1 or abs(np.linalg.det(found.reshape(3, 4)[:, :3])) < 0.5:  # a rotation has 1
-        raise DataError(f"{path} without a pose 'Tr:'", "that of the sensor before the camera", "restore the file")
+        raise DataError(f"{path} without a pose{told}", "that of one sensor seen from another", "restore the file")
     return _homogeneous(found.reshape(1, 3, 4))[0]
 
 

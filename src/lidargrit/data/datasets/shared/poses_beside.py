@@ -1,6 +1,5 @@
 """A file of a scan → when and where it was made, by files of times and poses in the folders above it."""
 
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ from jaxtyping import Float64
 from lidargrit.core import reporting
 from lidargrit.core.determinism import natural_order
 from lidargrit.core.errors import ConfigError, DataError, printable
-from lidargrit.core.files import read_text
+from lidargrit.core.files import read_text, remembered
 from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.scans.motion import Motion
 
@@ -43,7 +42,7 @@ def time_beside(path: Path) -> float | None:
     return float(times_s[number]) if number < len(times_s) else None
 
 
-@lru_cache(maxsize=64)
+@remembered(lambda path: [path])
 def _is_trajectory(path: Path) -> bool:
     """Return whether a file has TUM's rows of a time and a pose, which are of no scan in particular; tell it once."""
     rows = (row for row in read_text(path).splitlines() if row.strip() and not row.lstrip().startswith("#"))
@@ -54,18 +53,20 @@ def _is_trajectory(path: Path) -> bool:
     return True
 
 
-@lru_cache(maxsize=64)
+@remembered(lambda folder, suffix: [folder])
 def _places(folder: Path, suffix: str) -> dict[str, int]:
     files = natural_order(path for path in folder.glob(f"*{suffix}") if path.is_file())
     return {file.name: place for place, file in enumerate(files)}
 
 
-@lru_cache(maxsize=64)
+@remembered(lambda path: [path])
 def _timestamps_s(path: Path) -> Float64[np.ndarray, "n"]:
     wanted = "a row such as 2011-09-26 13:02:25.951199337 for each scan"
     try:
         rows = read_text(path).split("\n") if path.is_file() else []
         times = np.array([row.strip() for row in rows if row.strip()], dtype="datetime64[ns]")
+        if np.isnat(times).any():  # which NumPy reads as a time
+            raise ValueError
     except (ConfigError, ValueError):
         raise DataError(f"{path} with a row that is no time", wanted, "restore the file") from None
     return (times - times[:1]) / np.timedelta64(1, "s") if len(times) else np.zeros(0)

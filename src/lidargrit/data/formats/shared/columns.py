@@ -21,6 +21,7 @@ REFLECTANCE_RULE = (
 )
 
 _NO_NUMBER = re.compile(rb"[-+]?(?:nan\([a-z0-9_]{0,20}\)|1\.?#(?:qnan|snan|ind|inf)[0-9]{0,20})", re.IGNORECASE)
+_BETWEEN_NAMES = re.compile(r"[\s,;]+")
 _LINE_BYTES_AT_MOST = 65_536  # of text; real ones take up to some hundreds
 _WITHIN_A_SCAN_S = 2.0
 
@@ -77,6 +78,11 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
         # Within a scan 32 bits keep less than a microsecond, as drivers write it; times of a clock take 64.
         columns["time"] = times_s.astype(np.float32 if np.abs(times_s).max() < _WITHIN_A_SCAN_S else np.float64)
     return columns
+
+
+def one_word(name: str) -> str:
+    """Return the name of a column as headers of text can hold it: blanks and signs between names would make two."""
+    return _BETWEEN_NAMES.sub("_", name)
 
 
 def plain_text(data: bytes) -> bytes:
