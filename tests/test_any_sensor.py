@@ -159,6 +159,14 @@ class LabelledImages(SeededImages):
         return Pixels(range_m, {"label": label.astype(np.int64)})
 
 
+@pytest.mark.parametrize("sensor", [EVEN, ODD], ids=["cells of 16", "cells of 8"])
+def test_phases_of_other_sensors_leave_the_numbers_of_a_mask_uniform(sensor: SensorModel) -> None:
+    mask = random_decoder(EVEN).for_sensor(sensor).mask
+    mask.noise.sums[..., :2] = torch.tensor([50.0, 100.0])  # in all phases that any sensor has, pixels correlate
+    numbers = mask.uniform(rngs(2000)).double()
+    assert torch.special.ndtri(numbers).std(0).sub(1).abs().max() < 0.08  # 0.016 is the error of one
+
+
 def test_drawn_sensors_are_within_the_bounds_and_follow_from_their_seed() -> None:
     sensors = [load_sensor(f"drawn_{seed}") for seed in range(120)]
     for sensor in sensors:
