@@ -159,6 +159,13 @@ class LabelledImages(SeededImages):
         return Pixels(range_m, {"label": label.astype(np.int64)})
 
 
+def test_a_decoder_behind_a_tokenizer_has_no_absent_rows() -> None:
+    assert PixelDecoder(CONFIG, EVEN, features=4).grid is EVEN
+    told = "images of 13 rows, behind a tokenizer or the past; wanted rows in multiples of 16"
+    with pytest.raises(ConfigError, match=told):
+        PixelDecoder(CONFIG, ODD, features=4)
+
+
 @pytest.mark.parametrize("sensor", [EVEN, ODD], ids=["cells of 16", "cells of 8"])
 def test_phases_of_other_sensors_leave_the_numbers_of_a_mask_uniform(sensor: SensorModel) -> None:
     mask = random_decoder(EVEN).for_sensor(sensor).mask

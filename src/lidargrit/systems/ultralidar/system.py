@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.typed_values import Bounds
-from lidargrit.generation.batches import check_seeds
+from lidargrit.generation.batches import BatchSeeds, check_seeds
 from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -206,8 +206,8 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         self.eval()
         return torch.cat([self._voxels(int(seed), settings) for seed in seeds])
 
-    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: VoxelSampling) -> RangeImage:
-        occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds])
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: VoxelSampling) -> RangeImage:
+        occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds[: seeds.num_asked_for]])
         return self._images(occupied, sampling.points)
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:
