@@ -20,6 +20,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, phases_of
 from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds, row_features, with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokens import PixelObjective
+from lidargrit.nn.blocks import Block, prepare_for_training
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel, SensorSetup, load_sensor
@@ -157,6 +158,14 @@ class LabelledImages(SeededImages):
         range_m = super().read(index).range_m
         label = np.where(np.arange(range_m.size).reshape(range_m.shape) % 3, 50, 10)
         return Pixels(range_m, {"label": label.astype(np.int64)})
+
+
+def test_activations_are_computed_again_for_every_sensor() -> None:
+    decoder = random_decoder(EVEN)
+    prepare_for_training(decoder, recompute=True, compiled=False)
+    blocks = [each for each in decoder.for_sensor(ODD).modules() if isinstance(each, Block)]
+    assert blocks
+    assert all(each.recomputed for each in blocks)
 
 
 def test_a_decoder_behind_a_tokenizer_has_no_absent_rows() -> None:
