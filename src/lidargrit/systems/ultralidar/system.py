@@ -110,7 +110,6 @@ class CodebookRestart(nn.Module):
 
 
 _CODEBOOK_WEIGHT = 10.0  # of the quantiser's loss
-_COLLAPSED_BELOW = 0.05  # of the codes in effective use
 _ROUNDS_AT_MOST = 1000
 
 
@@ -291,12 +290,7 @@ class VoxelReconstruction(Objective):
 
     def warnings(self) -> list[str]:
         """Return a line if few codes are in effective use."""
-        quantiser, count = self.autoencoder.quantiser, self.autoencoder.config.num_codes
-        perplexity = float(quantiser.perplexity())
-        if perplexity >= _COLLAPSED_BELOW * count:
-            return []
-        usage = f"{perplexity:.1f} of {count} codes in effect, {quantiser.used_share():.0%} alive"
-        return [f"few codes are used: {usage}; the remedy: more scans, or a lower model.autoencoder.num_codes"]
+        return self.autoencoder.quantiser.warnings("more scans, or a lower model.autoencoder.num_codes")
 
 
 class HiddenVoxelTokens(Objective):
