@@ -20,6 +20,7 @@ from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, phases_of
 from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds, row_features, with_absent_rows
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.generation.tokens import PixelObjective
+from lidargrit.nn.blocks import Block, prepare_for_training
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel, SensorSetup, load_sensor
@@ -157,6 +158,29 @@ class LabelledImages(SeededImages):
         range_m = super().read(index).range_m
         label = np.where(np.arange(range_m.size).reshape(range_m.shape) % 3, 50, 10)
         return Pixels(range_m, {"label": label.astype(np.int64)})
+
+
+def test_activations_are_computed_again_for_every_sensor() -> None:
+    decoder = random_decoder(EVEN)
+    prepare_for_training(decoder, recompute=True, compiled=False)
+    blocks = [each for each in decoder.for_sensor(ODD).modules() if isinstance(each, Block)]
+    assert blocks
+    assert all(each.recomputed for each in blocks)
+
+
+def test_a_decoder_behind_a_tokenizer_has_no_absent_rows() -> None:
+    assert PixelDecoder(CONFIG, EVEN, features=4).grid is EVEN
+    told = "images of 13 rows, behind a tokenizer or the past; wanted rows in multiples of 16"
+    with pytest.raises(ConfigError, match=told):
+        PixelDecoder(CONFIG, ODD, features=4)
+
+
+@pytest.mark.parametrize("sensor", [EVEN, ODD], ids=["cells of 16", "cells of 8"])
+def test_phases_of_other_sensors_leave_the_numbers_of_a_mask_uniform(sensor: SensorModel) -> None:
+    mask = random_decoder(EVEN).for_sensor(sensor).mask
+    mask.noise.sums[..., :2] = torch.tensor([50.0, 100.0])  # in all phases that any sensor has, pixels correlate
+    numbers = mask.uniform(rngs(2000)).double()
+    assert torch.special.ndtri(numbers).std(0).sub(1).abs().max() < 0.08  # 0.016 is the error of one
 
 
 def test_drawn_sensors_are_within_the_bounds_and_follow_from_their_seed() -> None:

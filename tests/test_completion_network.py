@@ -9,7 +9,10 @@ from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.run_folder import locate
 from lidargrit.generation.generator import load, load_class
+from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
+from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.settings import Preset, TrainingConfig
+from lidargrit.scans import fills
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import fill
 from lidargrit.scans.sensors import load_sensor
@@ -18,6 +21,7 @@ from lidargrit.systems.completion.classical_features import classical_features
 from lidargrit.systems.completion.network import CompletionNetwork, CompletionNetworkConfig
 from lidargrit.systems.completion.system import Completion, CompletionConfig, CompletionObjective, random_patterns
 from lidargrit.systems.lidargrit.system import TokenSampling
+from lidargrit.systems.ultralidar.system import UltraLidar
 from lidargrit.training.taken_stages import taken_stages
 from tiny_runs import learn, save_bundle
 
@@ -44,6 +48,31 @@ def rows_of(images: RangeImage) -> Observed:
 def made() -> CompletionNetwork:
     torch.manual_seed(0)
     return CompletionNetwork(TINY, SENSOR).eval()
+
+
+@pytest.mark.parametrize("name", ["completion", "raydrop", "interpolation", "ultralidar", "lidargrit"])
+def test_scans_that_are_computed_one_by_one_cost_no_copies(name, monkeypatch):
+    """They fill a batch up to its size; a GPU's has 8 scans if the caller names no other."""
+    cls, counted = load_class(name), []
+    config = cls.smallest_config(SENSOR)
+    generator = cls(replace(config, pixels=PixelDecoderConfig(mask_width=4)) if name == "lidargrit" else config, SENSOR)
+    for owner, each in ((MaskNetwork, "sample"), (fills.SeenScan, "of"), (UltraLidar, "_voxels")):
+        monkeypatch.setattr(owner, each, counting(getattr(owner, each), counted))
+    sampling = replace(cls.quickest_sampling(), batch_size=8)
+    if cls.has_new_scans:
+        generator.sample([1], sampling=sampling)
+    else:
+        kind = Observed.of_surfaces if name == "raydrop" else rows_of
+        generator.complete(kind(scans(1)), [1], sampling)
+    assert len(counted) == (2 if name == "completion" else 1)  # the classical features, then the mask
+
+
+def counting(function, counted):
+    def call(*arguments, **named):
+        counted.append(function)
+        return function(*arguments, **named)
+
+    return call
 
 
 def test_hints_tell_the_next_return_on_every_side():

@@ -259,6 +259,14 @@ def test_completion_keeps_what_was_observed():
     assert float(error) < 0.5 * float(of_guess)
 
 
+def test_a_latent_is_searched_for_in_inference_mode_too(images):
+    generator, sampling = made(), DustySampling(search_steps=2)
+    known = Observed.of_pixels(images, torch.ones_like(images.return_mask))
+    with torch.inference_mode():
+        found = generator.complete(known, range(len(images)), sampling)
+    assert torch.equal(found.range_m, generator.complete(known, range(len(images)), sampling).range_m)
+
+
 def test_a_gradient_reaches_every_weight_of_the_player_alone(images):
     game = made(replace(TINY, variant="dusty_2")).objective("adversarial").train()
     for phase, mine in (("discriminator", "discriminator."), ("generator", "synthesis.")):

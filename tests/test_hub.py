@@ -116,7 +116,10 @@ def test_a_model_is_uploaded_in_8_bits(tmp_path, monkeypatch):
     )
     assert set(sent["files"]) == {"README.md", "config.json", "model.safetensors"}
     assert set(sent["upload"]) <= set(uploads)
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "checkpoint.safetensors").write_text("an owner's, as that of a run")
     assert model.save_pretrained(tmp_path / "here", repo_id="me/mine", push_to_hub=True) == url
+    assert set(sent["files"]) == {"config.json", "model.safetensors"}
     model.save(tmp_path / "whole")
     whole = (tmp_path / "whole" / "model.safetensors").stat().st_size
     assert sent["files"]["model.safetensors"] == (tmp_path / "here" / "model.safetensors").stat().st_size < whole / 2

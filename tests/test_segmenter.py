@@ -119,6 +119,15 @@ def test_the_terms_are_those_of_a_loop():
     assert float(terms["mean_iou"]) == pytest.approx(sum(iou) / len(iou), rel=1e-5)
 
 
+def test_scans_without_a_label_teach_nothing():
+    images = RangeImage.stack([project(scan_of(3, 64), SENSOR)])
+    objective = SegmenterObjective(made(config=replace(TINY, reflectance=False)).segmenter, SENSOR)
+    terms = objective(Example(images.with_planes(label=torch.zeros_like(images.label))), torch.Generator())
+    terms["loss"].backward()
+    assert all(float(term.detach()) == 0 for term in terms.values())
+    assert all(float(weight.grad.abs().max()) == 0 for weight in objective.parameters())
+
+
 def test_attention_that_the_network_cannot_have_is_refused():
     with pytest.raises(ConfigError, match="2 layers of attention of 4 heads, 96 channels; wanted at most 1 layers"):
         SegmenterNetworkConfig(blocks=1, attention_layers=2)

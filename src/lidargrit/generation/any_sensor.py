@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice
 from lidargrit.generation.pixel_decoder.ray_encoding import RowEncoding, with_absent_rows
+from lidargrit.nn.blocks import Block
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel, mean_azimuths_rad
 
@@ -57,6 +58,9 @@ class RayNetwork(nn.Module, ABC):
         if found is None or next(found.buffers()).device != device:
             with torch.random.fork_rng(devices=[]):  # the weights that it begins with are not used
                 found = sharing_weights(self.made_for(sensor).to(device), self)
+            for other, own in zip(found.modules(), self.modules(), strict=True):
+                if isinstance(other, Block) and isinstance(own, Block):
+                    other.recomputed = own.recomputed
             if len(self._others) >= _SENSORS_KEPT:
                 del self._others[next(iter(self._others))]
             self._others[sensor] = found

@@ -200,8 +200,8 @@ class SavedModel(nn.Module, Generic[ConfigT]):
             write_text(folder / CARD_FILE, card)
         if not push_to_hub:
             return None
-        name, message = repo_id or folder.name, "Add a model"
-        return upload(folder, name, commit_message=message, private=private, token=token, branch=None, create_pr=None)
+        # Not the folder, in which other files may lie: a run's checkpoints and its scans' names are its owner's.
+        return self.push_to_hub(repo_id or folder.name, card=card, bits=bits, private=private, token=token)
 
     def push_to_hub(
         self,

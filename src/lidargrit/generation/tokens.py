@@ -170,10 +170,10 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
         tokenizer: Tokenizer,
         condition: Observed | None = None,
     ) -> RangeImage:
-        """Decode sampled tokens to scans: those that are wanted, and the rest of the last one's batch.
+        """Decode sampled tokens to scans: those that are wanted, and perhaps the rest of the last one's batch.
 
         Scans are decoded in batches of one size, as tokens are sampled, because kernels differ by the size; on a GPU
-        all of them at once.
+        all of them at once. On a CPU the pixel decoder samples scan by scan, and those that are wanted alone.
 
         Args:
             tokens: tokens of a batch of scans in raster order.
@@ -182,14 +182,15 @@ class TokenGenerator(Generator[TokenConfigT, SamplingT]):
             tokenizer: the generator's own tokenizer, or its copy for decoding only.
         """
         images = []
-        at_once = _DECODED_AT_ONCE if tokens.device.type == "cpu" else len(tokens)
+        at_once, last = (_DECODED_AT_ONCE, wanted) if tokens.device.type == "cpu" else (len(tokens), len(tokens))
         for first in range(0, wanted, at_once):
             some = slice(first, first + at_once)
             grid = TokenGrid.unchecked(tokens[some].unflatten(1, tokenizer.grid_size), tokenizer.num_codes)
             with products_in(pixels.precision):
                 if self.pixels is not None and mask in ("auto", "pixels"):
                     part = None if condition is None else condition[some]
-                    images.append(self.pixels.sample(tokenizer.decode(grid), rngs[some], pixels, part))
+                    own = rngs[first : min(first + at_once, last)]
+                    images.append(self.pixels.sample(tokenizer.decode(grid), own, pixels, part))
                 else:
                     method = "threshold" if mask == "threshold" else "bernoulli"
                     images.append(tokenizer.sample(grid, rngs[some], method))

@@ -17,6 +17,7 @@ CodebookLoss = Literal["paper", "reference", "vqvae", "ema"]
 # "ema" the codes follow the mean of their latents instead of a gradient (same paper, appendix A.1).
 _LOSS_WEIGHTS = {"paper": (1.0, 1.0), "reference": (1.0, 0.25), "vqvae": (0.25, 1.0), "ema": (0.25, 0.0)}
 _EMA_DECAY = 0.99
+_COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
 _DEAD_BELOW = 0.1  # a code that is chosen less often than this share of an even use is dead
 
 
@@ -84,9 +85,14 @@ class VectorQuantiser(nn.Module):
         share = self.usage / self.usage.sum().clamp(min=1e-9)
         return torch.special.entr(share).sum().exp()
 
-    def used_share(self) -> float:
-        """Return the share of codes that are used often enough not to be dead."""
-        return float((self.usage > self._dead_below()).float().mean())
+    def warnings(self, remedy: str) -> list[str]:
+        """Return a line with the remedy if few codes are in effective use."""
+        perplexity, count = float(self.perplexity()), len(self.usage)
+        if perplexity >= _COLLAPSED_BELOW * count:
+            return []
+        alive = float((self.usage > self._dead_below()).float().mean())
+        used = f"{perplexity:.1f} of {count} codes in effect, {alive:.0%} alive"
+        return [f"the codebook has collapsed: {used}; the remedy: {remedy}"]
 
     @torch.no_grad()
     def share(self) -> Float[Tensor, "K"]:

@@ -7,7 +7,6 @@ import resource
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 import torch
@@ -138,7 +137,7 @@ class Engine:
             first, last = (number * len(example) // parts for number in (part, part + 1))
             some = example if parts == 1 else example[first:last]
             with self._fabric.no_backward_sync(self._objective, enabled=part < parts - 1):
-                found = self._objective(partial(_same, some), derive_seed(seed, part) if part else seed, player)
+                found = self._objective(lambda one=some: one, derive_seed(seed, part) if part else seed, player)
                 loss = self._mean(found["loss"].detach().clone())
                 if not self._goes_on(loss):
                     return {**found, "loss": loss}, False
@@ -197,10 +196,6 @@ class _UncastInputs(nn.Module):
     def forward(self, example: Callable[[], Example], seed: int, player: str) -> dict[str, Tensor]:
         device = next(self.objective.parameters()).device
         return self.objective(example(), torch.Generator(device).manual_seed(seed), player)
-
-
-def _same(example: Example) -> Example:
-    return example
 
 
 def _turns(objective: Objective) -> tuple[str, ...]:

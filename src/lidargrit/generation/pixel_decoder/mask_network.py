@@ -42,7 +42,7 @@ class MaskNetwork(PhaseNetwork):
         if config.any_sensor:
             rows = (sensor.elevation_rad.double().mean(1) / -ROW_RAD).tolist()
             places = rows, 2 * math.pi / sensor.width / COLUMN_RAD
-        self.noise = PhaseNoise(self._learned, places)
+        self.noise = PhaseNoise(self._learned, places, self.phases)
 
     @classmethod
     def behind(cls, features: int, width: int, network: RayNetwork) -> "MaskNetwork":

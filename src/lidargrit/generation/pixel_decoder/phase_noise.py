@@ -35,6 +35,7 @@ class PhaseNoise(nn.Module):
         phases: all phases of the pixel decoder.
         places: place of every row, and distance of two columns, in rows and columns of a typical sensor, by which the
             noise decays; one for each row and column if not given.
+        sampled: those phases that sample the images at hand; all if not given. The others lie on the pixels of these.
 
     Source:
         Sklar's theorem for the copula; Kibble, An extension of a theorem of Mehler's on Hermite polynomials, 1945.
@@ -42,9 +43,15 @@ class PhaseNoise(nn.Module):
 
     sums: Tensor
 
-    def __init__(self, phases: Sequence[Phase], places: tuple[Sequence[float], float] | None = None) -> None:
+    def __init__(
+        self,
+        phases: Sequence[Phase],
+        places: tuple[Sequence[float], float] | None = None,
+        sampled: Sequence[Phase] | None = None,
+    ) -> None:
         super().__init__()
         self.phases, self._given = tuple(phases), places
+        self._sampled = frozenset(phases if sampled is None else sampled)
         # For each phase and direction (down, along the row): residuals' products, then the series' coefficients.
         self.register_buffer("sums", torch.zeros(len(phases), 2, 1 + _TERMS))
 
@@ -130,6 +137,8 @@ class PhaseNoise(nn.Module):
         shared = torch.randn((2, *uniform.shape), generator=rng, dtype=torch.float64)
         normal = torch.special.ndtri(uniform.double().clamp(_LEAST, 1 - _LEAST))
         for phase, (down, along) in zip(self.phases, shares.tolist(), strict=True):
+            if phase not in self._sampled:
+                continue
             own, rows, columns = normal[phase.pixels], shared[0][phase.pixels], shared[1][phase.pixels]
             of_rows, of_columns = self._places(phase, (own.shape[0], own.shape[1]))
             mixed = math.sqrt(1 - down - along) * own

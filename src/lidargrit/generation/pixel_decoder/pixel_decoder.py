@@ -111,6 +111,9 @@ class PixelDecoder(RayNetwork):
         super().__init__(sensor, config.any_sensor)
         if not config.any_sensor:
             _check_size(config, sensor)
+        elif features and self.grid is not sensor:
+            got = f"any_sensor=true for images of {sensor.height} rows, behind a tokenizer or the past"
+            raise ConfigError(got, "rows in multiples of 16 there", "leave model.pixels.any_sensor out")
         self.config, self._sizes = config, (features, components, gaps)
         self.mask = MaskNetwork(config, self.grid, features, sensor.height)
         decoded = components if config.decoded_components and features else 0
@@ -258,7 +261,8 @@ class PixelDecoder(RayNetwork):
         """Return one scan for each random generator; a scan does not depend on the others of its batch.
 
         Args:
-            decoded: output of the tokenizer's decoder for as many scans; None without a tokenizer.
+            decoded: output of the tokenizer's decoder for as many scans, or on a CPU for more, of which the last are
+                left out; None without a tokenizer.
             condition: observed part of the scans; nothing if not given. Observed returns and ranges are kept as they
                 are when their phase comes: later phases know of them, earlier ones do not.
         """

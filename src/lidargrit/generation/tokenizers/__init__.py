@@ -18,8 +18,6 @@ from lidargrit.nn.precision import Precision
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, MaskDecoding, RangeImage, TokenGrid
 
-_COLLAPSED_BELOW = 0.05  # perplexity over number of codes; healthy codebooks of ours keep above a half
-
 
 @dataclass(frozen=True)
 class TokenizerConfig(NamedConfig):
@@ -122,18 +120,11 @@ class CodebookTokenizer(Tokenizer[Config]):
 
     def warnings(self) -> list[str]:
         """Return a line with the remedy if the codebook has collapsed."""
-        perplexity, used = float(self.quantize.perplexity()), self.quantize.used_share()
-        if perplexity >= _COLLAPSED_BELOW * self.num_codes:
-            return []
-        remedy = (
+        return self.quantize.warnings(
             "raise the budget or lower model.tokenizer.num_codes"
             if self.quantize.restart_dead
             else "--set model.tokenizer.restart_dead_codes=true model.tokenizer.codebook_loss=ema"
         )
-        return [
-            f"the codebook has collapsed: {perplexity:.1f} of {self.num_codes} codes in effect, {used:.0%} alive; "
-            f"the remedy: {remedy}"
-        ]
 
 
 def make_tokenizer(config: TokenizerConfig, sensor: SensorModel) -> Tokenizer[Any]:

@@ -182,7 +182,7 @@ class Completion(Generator[CompletionConfig, SamplingSettings]):
         return CompletionObjective(self.completion, self.sensor)
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
-        return self.completion.sample(condition, rngs_of(seeds))
+        return self.completion.sample(condition, rngs_of(seeds[: seeds.num_asked_for]))  # one by one
 
     def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of two estimates of the range and all phases of the mask, counted while it is computed."""

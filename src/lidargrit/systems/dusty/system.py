@@ -220,9 +220,10 @@ class Dusty(Generator[DustyConfig, DustySampling]):
     def _latent_like(self, tensor: Tensor) -> Tensor:
         return tensor.to(self.synthesis.project.weight)
 
+    @torch.inference_mode(False)  # gradients are needed, also of a caller who computes in it
     def _search(self, images: RangeImage, seeds: Sequence[int], sampling: DustySampling) -> Float[Tensor, "B D"]:
         """Return the latents whose clean ranges are nearest to those of the returns, by mean inverse range error."""
-        target, returned = self.encoding.encode(images)[:, 0], images.return_mask
+        target, returned = self.encoding.encode(images)[:, 0], images.return_mask.clone()
 
         def error_of(latents: Tensor) -> Tensor:
             distance = (self.synthesis(latents)[0][:, 0] - target).abs() / 2

@@ -96,11 +96,7 @@ class Forecaster(Generator[ForecasterConfig, PixelSampling]):
 
     def objective(self, stage: str) -> Objective:
         """Return the negative log-likelihood of the pixels."""
-        return (
-            ForecasterObjective(self.pixels, self.past, self.config.own_past)
-            if stage == "pixels"
-            else super().objective(stage)
-        )
+        return ForecasterObjective(self.pixels, self.past, self.config.own_past)
 
     def told(self, condition: Condition, count: int) -> Decoded:
         """Return what the past tells of each pixel of a number of scans."""

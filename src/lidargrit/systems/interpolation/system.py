@@ -43,7 +43,7 @@ class Interpolation(Generator[InterpolationConfig, SamplingSettings]):
         return InterpolationConfig()
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: SamplingSettings) -> RangeImage:
-        return fill(self.config.method, condition).to(self.device)
+        return fill(self.config.method, condition[: seeds.num_asked_for]).to(self.device)  # one by one
 
     def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return no operations: there is no network."""

@@ -51,7 +51,7 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
 
     def objective(self, stage: str) -> Objective:
         """Return the negative log-likelihood of the pixels."""
-        return PixelObjective(self.pixels) if stage == "pixels" else super().objective(stage)
+        return PixelObjective(self.pixels)
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
         rngs = rngs_of(seeds)

@@ -149,7 +149,8 @@ class Raydrop(Generator[RaydropConfig, SamplingSettings]):
                 "the range of each surface, and which rays meet none",
                 "take clean scans of the whole circle, or a model that completes scans",
             )
-        return self.raydrop.sample(condition, rngs_of(seeds))
+        own = slice(seeds.num_asked_for)  # copies would take as long, since scans are sampled one by one
+        return self.raydrop.sample(condition[own], rngs_of(seeds[own]))
 
     def cost(self, sampling: SamplingSettings | None = None) -> Cost:
         """Return the cost of the features and of all phases of the mask, counted while they are computed."""

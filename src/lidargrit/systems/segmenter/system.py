@@ -144,6 +144,7 @@ class SegmenterObjective(Objective):
         of_class = counts[1:].sum(1)
         weight = torch.where(of_class > 0, of_class.clamp(min=1).rsqrt(), 0.0)
         loss = F.cross_entropy(logits, wanted - 1, weight, ignore_index=-1)  # 0, no class, becomes -1
+        loss = loss.where(of_class.any(), 0.0)  # scans without a label teach nothing, and have no mean
         accuracy = counts.diagonal()[1:].sum() / of_class.sum().clamp(min=1)
         mean_iou = class_iou(counts).nan_to_num().sum() / (of_class > 0).sum().clamp(min=1)
         return {"loss": loss, "accuracy": accuracy, "mean_iou": mean_iou}

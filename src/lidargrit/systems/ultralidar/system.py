@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from lidargrit.core.configuration import Settings
 from lidargrit.core.typed_values import Bounds
-from lidargrit.generation.batches import check_seeds
+from lidargrit.generation.batches import BatchSeeds, check_seeds
 from lidargrit.generation.encoding_cache import Frozen
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.generator import Generator
@@ -110,7 +110,6 @@ class CodebookRestart(nn.Module):
 
 
 _CODEBOOK_WEIGHT = 10.0  # of the quantiser's loss
-_COLLAPSED_BELOW = 0.05  # of the codes in effective use
 _ROUNDS_AT_MOST = 1000
 
 
@@ -206,8 +205,8 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
         self.eval()
         return torch.cat([self._voxels(int(seed), settings) for seed in seeds])
 
-    def _sample(self, seeds: Sequence[int], condition: Condition, sampling: VoxelSampling) -> RangeImage:
-        occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds])
+    def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: VoxelSampling) -> RangeImage:
+        occupied = torch.cat([self._voxels(seed, sampling) for seed in seeds[: seeds.num_asked_for]])
         return self._images(occupied, sampling.points)
 
     def _reconstruct(self, images: RangeImage) -> RangeImage:
@@ -291,12 +290,7 @@ class VoxelReconstruction(Objective):
 
     def warnings(self) -> list[str]:
         """Return a line if few codes are in effective use."""
-        quantiser, count = self.autoencoder.quantiser, self.autoencoder.config.num_codes
-        perplexity = float(quantiser.perplexity())
-        if perplexity >= _COLLAPSED_BELOW * count:
-            return []
-        usage = f"{perplexity:.1f} of {count} codes in effect, {quantiser.used_share():.0%} alive"
-        return [f"few codes are used: {usage}; the remedy: more scans, or a lower model.autoencoder.num_codes"]
+        return self.autoencoder.quantiser.warnings("more scans, or a lower model.autoencoder.num_codes")
 
 
 class HiddenVoxelTokens(Objective):
