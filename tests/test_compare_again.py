@@ -49,6 +49,20 @@ def test_scores_are_computed_again_with_weights_that_came_since(tmp_path, heard)
     assert scored() == (second, [], True), "nothing to score with again"
 
 
+def test_scores_are_computed_again_for_other_reflectance_on_the_same_ranges(tmp_path):
+    settings = EvalConfig(metrics=("reflectance_histogram",), resampling=Resampling(halves=0))
+
+    def scored(reflectance):
+        sets = (
+            EvalSet(name, RangeImages(SENSOR, [SeededImages(SENSOR, 2, of)]), range(2))
+            for name, of in (("a", reflectance), ("b", 0.5))
+        )
+        compare._score(EvalPair(*sets), settings, tmp_path / "scores.json")
+        return json.loads((tmp_path / "scores.json").read_text())["scores"][0]["value"]
+
+    assert [scored(of) for of in (0.5, 0.9)] == [0, 1]
+
+
 def test_a_few_samples_are_those_of_the_first_seeds(tmp_path):
     """They were spaced evenly over what an earlier comparison of more had left, unlike those of a system added now."""
     plain = replace(COMPARISON, settings=EvalConfig(metrics=("bev_jsd",), resampling=Resampling(halves=0)))

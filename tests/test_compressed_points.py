@@ -1,9 +1,11 @@
 """Every point comes back from a compressed file, each coordinate within half a step, or nothing does."""
 
+import json
 import os
 import subprocess
 import sys
 import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +16,12 @@ from hypothesis.extra.numpy import arrays
 
 from lidargrit.cli import main
 from lidargrit.core.errors import ScanError
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.inference.compress.command import decompress_scans
 from lidargrit.inference.compress.firings import Firings, turn
 from lidargrit.inference.compress.fit_firings import fit_firings
 from lidargrit.inference.compress.point_codec import Cloud, PointCodec
+from lidargrit.inference.compress.points_command import compress_points
 
 pytest.importorskip("constriction")
 CODEC = PointCodec(20)
@@ -160,6 +165,23 @@ def test_the_commands_restore_points_with_other_threads_and_instructions(tmp_pat
     assert "which holds points" in error
     assert "cut off or altered" in error
     assert error.count("\n") == 2
+
+
+def test_what_a_folder_holds_besides_is_told_and_a_step_that_no_command_takes_is_refused(tmp_path, heard):
+    file, folder = tmp_path / "points.lgz", tmp_path / "scans"
+    folder.mkdir()
+    np.eye(4, dtype=np.float32)[:3].tofile(folder / "scan.bin")
+    (folder / "more.laz").write_bytes(b"of another program")
+    compress_points(str(folder), file, 20, DataConfig())
+    assert any("1 file .laz beside 1 that are read left out" in line for line in heard)
+    with zipfile.ZipFile(file) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    members["header.json"] = json.dumps({**json.loads(members["header.json"]), "step_mm": 10**400}).encode()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    with pytest.raises(ScanError, match="not those of the machine"):
+        decompress_scans(file, tmp_path / "out", None, None, [])
 
 
 @pytest.mark.shared

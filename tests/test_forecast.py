@@ -80,6 +80,27 @@ def test_a_drive_that_was_stopped_goes_on_to_the_same_files(run, tmp_path):
     assert motion.pose[:3, 3].tolist() == pytest.approx([2, 0, 0])
 
 
+def test_scans_keep_the_poses_that_they_were_made_for(run, tmp_path):
+    """A changed file of poses gave older scans new poses, and fewer frames took those of the last ones away."""
+    path, sequence = tmp_path / "path.txt", tmp_path / "out" / "sequences" / "00"
+
+    def write(frames: int, y_m: int) -> int:
+        path.write_text(f"0 0 0 0 0 0 0 1\n1 5 {y_m} 0 0 0 0 1\n")
+        return write_drives(forecaster(), run, tmp_path / "out", [path_of(frames, path)], [5], path=str(path))
+
+    def rows() -> list[str]:
+        return [line for name in ("poses.txt", "times.txt") for line in (sequence / name).read_text().splitlines()]
+
+    assert write(3, 0) == 3
+    before = rows()
+    assert write(2, 0) == 2
+    assert rows() == before
+    assert len(before) == 2 * 3
+    with pytest.raises(OutputError, match=r"000001\.bin is another scan of"):
+        write(4, 9)
+    assert rows() == before
+
+
 def test_a_forecast_is_a_sample_given_the_scans_before_it(run, recorded, tmp_path):
     words = ["forecast", recorded, str(tmp_path / "out"), "--model", str(run), "-n", "1", "--after", "2", "--seed", "4"]
     assert main(words) == 0

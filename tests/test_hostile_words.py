@@ -64,3 +64,7 @@ def test_files_with_such_names_are_used_under_the_c_locale_or_told_in_one_line(t
     assert (tmp_path / "out" / "straße.pcd").is_file()
     assert "straße" in json.loads((tmp_path / "out" / "export.json").read_text(encoding="utf-8"))["scans"].values()
     assert (tmp_path / "page.html").is_file()
+    code, output = python(
+        ["-m", "lidargrit", "inspect", "走".encode()], tmp_path, cache | {"PYTHONIOENCODING": "ascii"}
+    )
+    assert code == 0, output

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 import lidargrit
-from lidargrit.core.errors import DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.data import formats
 from lidargrit.data.sources.memory import MemorySource
 from lidargrit.scans.classes import BUILDING, CLASS_BITS, ROAD
 
@@ -130,3 +131,16 @@ def test_values_that_are_not_one_a_point_are_refused():
         lidargrit.Scan.from_points(np.ones((3, 3)), ring=[1, 2])
     with pytest.raises(DataError, match="no scan in memory"):
         lidargrit.evaluate([], [np.ones((3, 3))])
+
+
+def test_folders_may_be_paths_and_other_mistakes_get_one_line(scan, nearest, tmp_path):
+    for number in range(2):
+        formats.load("kitti_bin").write(tmp_path / f"{number}.bin", scan)
+    card = lidargrit.evaluate(tmp_path, tmp_path, metrics=["return_rate_per_ring"])
+    assert [score.result.value for score in card.scores] == [0]
+    with pytest.raises(ConfigError, match="none, which does not exist"):
+        lidargrit.complete(scan, model=tmp_path / "none")
+    with pytest.raises(DataError, match="a single scan in place of a set"):
+        lidargrit.evaluate(scan, tmp_path)
+    with pytest.raises(ConfigError, match="the seed -1; wanted a whole number"):
+        lidargrit.complete(scan, model=nearest, seed=-1)

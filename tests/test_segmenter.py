@@ -245,6 +245,10 @@ def test_the_verb_writes_a_label_for_every_point_and_goes_on(run, tmp_path, caps
     (tmp_path / "out/sequences/00/velodyne/000000.bin").unlink()
     assert main(words) == 0
     assert labels[0].read_bytes() == before
+    (tmp_path / "in/sequences/00/velodyne/000000.bin").write_bytes(b"cut")  # the labels of the next one are looked at
+    skipping = ["segment", str(tmp_path / "in"), str(tmp_path / "skipped"), *words[3:], "--bad-scans", "skip"]
+    assert main([*skipping, "--compare", "semantic_kitti"]) == 0
+    assert [path.name for path in tmp_path.glob("skipped/sequences/00/velodyne/*")] == ["000001.bin"]
     page = tmp_path / "page.html"
     assert main(["view", str(tmp_path / "out"), "-o", str(page), "--set", "data.columns=64"]) == 0
     assert any(f'"{CLASSES[int(n)].name}"' in page.read_text() for n in np.unique(np.fromfile(labels[0], "<u4")) if n)

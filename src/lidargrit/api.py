@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from torch import Tensor
 
-from lidargrit.core.errors import ScanError
+from lidargrit.core.errors import DataError, ScanError
 from lidargrit.data import formats
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.run_folder import PACKAGED
@@ -91,7 +91,7 @@ def project(
 
 
 def complete(
-    points: Points, model: str | Model = "pretrained", seed: int = 0, sensor: SensorModel | str | None = None
+    points: Points, model: str | Path | Model = "pretrained", seed: int = 0, sensor: SensorModel | str | None = None
 ) -> CompletedScan:
     """Fill in every ray of a scan that has no point, and keep all points as they are.
 
@@ -117,7 +117,7 @@ def complete(
 
 
 def upsample(
-    points: Points, sensor: SensorModel | str, model: str | Model = "pretrained", seed: int = 0
+    points: Points, sensor: SensorModel | str, model: str | Path | Model = "pretrained", seed: int = 0
 ) -> CompletedScan:
     """Add the rows that a sensor with few of them lacks, and keep all points as they are.
 
@@ -130,7 +130,7 @@ def upsample(
     return complete_scan(_as_scan(points), _opened(model, "pixels"), AddRows(sensor), seed)
 
 
-def raydrop(points: Points, model: str | Model = "pretrained", seed: int = 0) -> CompletedScan:
+def raydrop(points: Points, model: str | Path | Model = "pretrained", seed: int = 0) -> CompletedScan:
     """Drop returns of a clean scan, such as a simulator's, that a real sensor would not get.
 
     Args:
@@ -172,8 +172,8 @@ def segment(points: Points, model: str | Segmenter = "pretrained") -> Scan:
 
 
 def evaluate(
-    generated: str | Sequence[Points],
-    reference: str | Sequence[Points],
+    generated: str | Path | Sequence[Points],
+    reference: str | Path | Sequence[Points],
     protocol: str = "exact",
     metrics: Sequence[str] = (),
     max_scans: int = 0,
@@ -196,7 +196,8 @@ def evaluate(
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    real = open_reference(reference, settings) if isinstance(reference, str) else _source(reference, sensor)
+    named = isinstance(reference, (str, Path))
+    real = open_reference(str(reference), settings) if named else _source(reference, sensor)
     return evaluate_pair(open_pair(_source(generated, sensor), real, settings), settings)
 
 
@@ -209,16 +210,18 @@ def _as_scan(points: Points) -> Scan:
     raise ScanError(f"points as {type(points).__name__}", wanted, "np.asarray(points), or lidargrit.load_scan(path)")
 
 
-def _source(scans: str | Sequence[Points], sensor: SensorModel) -> Source:
-    if isinstance(scans, str):
-        return open_source(scans)
+def _source(scans: str | Path | Sequence[Points], sensor: SensorModel) -> Source:
+    if isinstance(scans, (str, Path)):
+        return open_source(str(scans))
+    if isinstance(scans, Scan):
+        raise DataError("a single scan in place of a set", "several scans", "give them as a list")
     return MemorySource([_as_scan(points) for points in scans], sensor)
 
 
-def _opened(model: str | Model, kind: ConditionKind, sensor: SensorModel | None = None) -> Model:
+def _opened(model: str | Path | Model, kind: ConditionKind, sensor: SensorModel | None = None) -> Model:
     if isinstance(model, Model):
         return model
-    packaged = model in {folder.name for folder in PACKAGED}
+    packaged = str(model) in {folder.name for folder in PACKAGED}
     return _packaged_model(model, kind) if packaged and sensor is None else open_model(model, kind, sensor)
 
 

@@ -3,6 +3,7 @@
 import argparse
 import errno
 import importlib
+import io
 import os
 import sys
 from collections.abc import Iterator, Sequence
@@ -47,6 +48,8 @@ def _run(words: list[str], is_program: bool = False) -> int:
     _let_threads_sleep()
     if is_program:
         _keep_freed_memory()
+        if isinstance(sys.stdout, io.TextIOWrapper):  # names that its encoding lacks, as that of some locales
+            sys.stdout.reconfigure(errors="backslashreplace")
     parser = build_parser()
     try:
         options = _parsed(parser, words)

@@ -61,7 +61,7 @@ class EvalSet:
         return RangeImage.masked(images.range_m, mask, images.sensor, images.planes)
 
     def record(self) -> EvalSetRecord:
-        """Return the entry of the set in a score file; its hash is of the ranges before limits are applied."""
+        """Return the entry of the set in a score file; its hash is of the pixels before limits are applied."""
         sensor = self.images.sensor
         return EvalSetRecord(
             self.source,
@@ -78,7 +78,7 @@ class EvalSet:
 
     @cached_property
     def _sha256(self) -> str:
-        """Hash of the compared ranges; it reads every image where a set has no fingerprints, so once."""
+        """Hash of the compared pixels; it reads every image where a set has no fingerprints, so once."""
         content = hashlib.sha256()
         fingerprints = self.images.provenance.fingerprints
         if len(fingerprints) == len(self.images):  # of the images with all fine columns: of which some were compared
@@ -90,7 +90,8 @@ class EvalSet:
         else:
             for first in range(0, len(self), _BATCH):
                 batch = self.images.batch(self.indices[first : first + _BATCH])
-                content.update(batch.range_m.contiguous().numpy().data)
+                for pixels in (batch.range_m, *batch.planes.values()):
+                    content.update(pixels.contiguous().numpy().data)
         return content.hexdigest()
 
 

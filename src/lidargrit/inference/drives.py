@@ -15,6 +15,7 @@ from torch import Tensor
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
+from lidargrit.core.files import sha256_of_json
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.run_folder import locate
@@ -33,6 +34,7 @@ from lidargrit.scans.types import RangeImage, Scan
 
 MANIFEST = "drive.json"
 PERIOD_S, _SPEED_M_S = 0.1, 10.0  # of a drive from nothing
+_DIGITS = 6  # of metres and seconds behind the point, in which all machines agree
 
 Pose = Float64[Tensor, "4 4"]
 
@@ -66,6 +68,18 @@ class Way:
     poses: Sequence[Pose]
     begin_s: float = 0.0
     period_s: float = PERIOD_S
+
+    def from_first(self, pose: Pose) -> Float64[np.ndarray, "4 4"]:
+        """Return a pose in the frame of the first generated scan."""
+        return transform_between(pose, self.poses[0]).numpy()
+
+    def places(self) -> list[str]:
+        """Return a hash of where and when each generated scan is made, beside the first one and those that are seen."""
+        seen = [(self.from_first(one.pose), one.time_s - self.begin_s) for one in self.seen]
+        made = [(self.from_first(pose), number * self.period_s) for number, pose in enumerate(self.poses)]
+        words = [[round(float(each), _DIGITS) + 0.0 for each in (*pose.flat, at_s)] for pose, at_s in (*seen, *made)]
+        before, own = words[: len(seen)], words[len(seen) :]
+        return [sha256_of_json([before, each])[:12] for each in own]
 
 
 def path_of(frames: int, path: Path | None = None) -> Way:
@@ -166,18 +180,20 @@ def write_drives(
         raise ConfigError(got, f"those of {generator.sensor.name!r}", "name a run of that sensor")
     names = [f"{drive:02d}/{frame:06d}" for drive, way in enumerate(ways) for frame in range(len(way.poses))]
     identities = [
-        ScanIdentity(f"seed {seed}, frame {n}")
+        ScanIdentity(f"seed {seed}, frame {frame}, {place}")
         for seed, way in zip(seeds, ways, strict=True)
-        for n in range(len(way.poses))
+        for frame, place in enumerate(way.places())
     ]
     identity = {"source": str(run_folder), **facts, **sampling_identity(generator, run_folder, settings)}
     folder = ScanFolder(out, MANIFEST, identity, KittiTree(out).files(names), identities)
     with folder.writing("sampling") as progress:
         folder.tell_sensor(generator.sensor)
         for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
-            moved = [transform_between(pose, way.poses[0]).numpy() for pose in way.poses]
-            write_motions(out, f"{drive:02d}", moved, [number * way.period_s for number in range(len(moved))])
-            _Drive(generator, opening, way, seed, out / "sequences" / f"{drive:02d}", settings).write(progress)
+            sequence = out / "sequences" / f"{drive:02d}"
+            if sum(1 for _ in sequence.glob("velodyne/*.bin")) <= len(way.poses):  # else rows of more scans are there
+                moved = [way.from_first(pose) for pose in way.poses]
+                write_motions(out, f"{drive:02d}", moved, [number * way.period_s for number in range(len(moved))])
+            _Drive(generator, opening, way, seed, sequence, settings).write(progress)
     return folder.num_written
 
 

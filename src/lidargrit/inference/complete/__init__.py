@@ -73,7 +73,7 @@ class Model:
 
 
 def open_model(
-    word: str,
+    word: str | Path,
     kind: ConditionKind = "pixels",
     sensor: SensorModel | None = None,
     settings: Sequence[str] = (),
@@ -90,6 +90,7 @@ def open_model(
     Raises:
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
     """
+    word = str(word)
     if is_classical(word):
         if kind != "pixels":
             got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import torch
 
 from lidargrit.core.determinism import derive_seed
+from lidargrit.generation.batches import check_seeds
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.cloud import CompletedScan, dropped_scan, filled_scan
 from lidargrit.inference.complete.grid import RayGrid, columns_fired
@@ -180,6 +181,7 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
         >>> bool((whole.points_xyz_m[: len(scan)] == scan.points_xyz_m).all())
         True
     """
+    check_seeds([seed])
     task = task or Fill(Pattern("returns"))
     seen = task.see(scan, model)
     seeds = seen.rays.seeds(seed)

@@ -7,6 +7,7 @@ import torch
 
 from lidargrit.core import reporting
 from lidargrit.core.errors import ScanError, UsageError, no_usable_scan
+from lidargrit.core.untrusted import STEP_MM_AT_MOST
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, ScanIdentity, check_names, writable_format
@@ -45,6 +46,7 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
                 data, count = b"", 0
                 try:
                     scan = scans.scan(index)
+                    scans.tell_notes(scan)
                     data, count = codec.compress(_cloud(scan)), len(scan)
                 except ScanError as error:
                     if config.bad_scans != "skip":
@@ -81,7 +83,7 @@ def decompress_points(archive: Archive, out: Path, kind: str, indices: Sequence[
         raise UsageError(got, "a format of points", "leave --format out, or name bin, pcd, ply or npz")
     form, suffix = writable_format(kind)
     step_mm = archive.header.get("step_mm")
-    if not isinstance(step_mm, int) or step_mm < 1:
+    if not (isinstance(step_mm, int) and 1 <= step_mm <= STEP_MM_AT_MOST):
         raise not_reproduced()
     codec, names = PointCodec(step_mm), [archive.names[index] for index in indices]
     facts = {"source": archive.path.name, "index_crc32": archive.index_crc32, "step_mm": step_mm, "format": kind}

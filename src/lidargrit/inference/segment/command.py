@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.errors import ConfigError, DataError, ScanError
 from lidargrit.core.table import Table
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
@@ -115,7 +115,7 @@ def segment_scans(
     scores = LabelScores() if numbering else None
     wanted = folder.missing if scores is None else range(len(files))
     if scores is not None:
-        _own_labels(source_scans.scan(0), numbering)  # a mistake is told before anything is written
+        _check_labels(source_scans, numbering, config.bad_scans == "skip")  # told before anything is written
     with folder.writing("labelling", len(wanted)) as progress:
         for index in wanted:
             with folder.leaving_out(index):
@@ -131,6 +131,19 @@ def segment_scans(
                     scores.add(label, _own_labels(scan, numbering))
             progress.advance(1)
     return folder.num_written, scores
+
+
+def _check_labels(scans: NamedScans, numbering: str, skips: bool) -> None:
+    """Refuse scans whose first one, or first usable one, has no labels of a numbering."""
+    for index in range(len(scans)):
+        try:
+            scan = scans.scan(index)
+        except ScanError:
+            if not skips:
+                raise
+        else:
+            _own_labels(scan, numbering)
+            return
 
 
 def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans:
