@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.table import Table
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
@@ -114,36 +114,22 @@ def segment_scans(
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     scores = LabelScores() if numbering else None
     wanted = folder.missing if scores is None else range(len(files))
-    if scores is not None:
-        _check_labels(source_scans, numbering, config.bad_scans == "skip")  # told before anything is written
     with folder.writing("labelling", len(wanted)) as progress:
         for index in wanted:
             with folder.leaving_out(index):
                 scan = source_scans.scan(index)
-                if scores is None:  # else the user knows that labels are of another numbering
+                own = _own_labels(scan, numbering) if numbering else None  # a mistake is told before a file is written
+                if own is None:  # else the user knows that labels are of another numbering
                     source_scans.tell_notes(scan)
                 label = labels.of(index, scan)
                 if index in folder.missing:
                     if labels.sensor.name != KittiOdometry.sensor:  # else readers of such trees take it anyway
                         folder.tell_sensor(labels.sensor)
                     write_with_labels(out / files[index], replace(scan, label=label))
-                if scores is not None:
-                    scores.add(label, _own_labels(scan, numbering))
+                if scores is not None and own is not None:
+                    scores.add(label, own)
             progress.advance(1)
     return folder.num_written, scores
-
-
-def _check_labels(scans: NamedScans, numbering: str, skips: bool) -> None:
-    """Refuse scans whose first one, or first usable one, has no labels of a numbering."""
-    for index in range(len(scans)):
-        try:
-            scan = scans.scan(index)
-        except ScanError:
-            if not skips:
-                raise
-        else:
-            _own_labels(scan, numbering)
-            return
 
 
 def _opened(source: str, segmenter: Segmenter, config: DataConfig) -> NamedScans:
