@@ -98,13 +98,14 @@ def _streets():
 
     Tests of the simulator import the function itself.
     """
+    from lidargrit.scans.sensors import load_sensor
     from lidargrit.simulator import simulate  # now its functions come with their checks
 
     kept = OrderedDict()
 
     @functools.wraps(simulate)
     def simulate_once(seed, sensor=None, **options):
-        street = (seed, sensor and json.dumps(sensor.to_json()), repr(options))
+        street = (seed, sensor and json.dumps(load_sensor(sensor).to_json()), repr(options))
         found = kept.get(street)  # threads may ask at once
         if found is None:
             found = kept[street] = simulate(seed, sensor, **options)

@@ -1,5 +1,6 @@
 """``import lidargrit`` as people meet it: arrays of NumPy and tensors of torch go in, whole clouds come out."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,10 +8,11 @@ import pytest
 import torch
 
 import lidargrit
-from lidargrit.core.errors import ConfigError, DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, ScanError, UnknownNameError
 from lidargrit.data import formats
 from lidargrit.data.sources.memory import MemorySource
 from lidargrit.scans.classes import BUILDING, CLASS_BITS, ROAD
+from lidargrit.scans.types import RangeImage
 
 SENSOR = lidargrit.load_sensor("hdl64e_kitti_odometry")
 
@@ -144,3 +146,54 @@ def test_folders_may_be_paths_and_other_mistakes_get_one_line(scan, nearest, tmp
         lidargrit.evaluate(scan, tmp_path)
     with pytest.raises(ConfigError, match="the seed -1; wanted a whole number"):
         lidargrit.complete(scan, model=nearest, seed=-1)
+
+
+def test_sensors_are_named_given_or_in_a_file(scan, tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps(SENSOR.with_columns(256).to_json()))
+    images = [lidargrit.project(scan.points_xyz_m, each) for each in (path, str(path), lidargrit.load_sensor(path))]
+    assert all(torch.equal(image.range_m, images[0].range_m) for image in images)
+    fates = [lidargrit.inspect(scan.points_xyz_m, each).fate for each in (path, str(path))]
+    np.testing.assert_array_equal(*fates)
+    streets = [lidargrit.simulate(1, each, kept_columns_only=True) for each in (path, SENSOR.with_columns(256))]
+    assert torch.equal(streets[0].points_xyz_m, streets[1].points_xyz_m)
+
+
+def test_range_images_in_memory_are_scored_as_the_samples_that_they_are(scan):
+    streets = [lidargrit.simulate(seed=seed) for seed in (1, 2)]
+    images = RangeImage.stack([lidargrit.project(each, SENSOR) for each in streets])
+    found, of_points = (
+        lidargrit.evaluate(each, [scan, scan], metrics=["point_cloud_jsd"]).scores[0].result.value
+        for each in (images, streets)
+    )
+    assert found == of_points
+    with pytest.raises(ScanError, match=r"points as RangeImage; .*; take its points: lidargrit\.unproject\(image\)"):
+        lidargrit.complete(images[0])
+
+
+def test_another_sensor_than_the_points_is_doubted_aloud(scan, nearest):
+    with pytest.warns(UserWarning, match="of two lasers"):
+        lidargrit.upsample(scan.points_xyz_m, "vlp16", nearest)
+    card = lidargrit.evaluate([scan], [scan], metrics=["point_cloud_jsd"], sensor="vlp16")
+    assert any("of two lasers" in warning for warning in card.warnings)
+    with pytest.raises(ConfigError, match="vlp16"):
+        lidargrit.complete(scan, nearest, sensor="vlp16")
+
+
+def test_models_of_another_kind_are_refused_in_one_line(scan):
+    loaded = lidargrit.load("pretrained")
+    with pytest.raises(ConfigError, match=r"a LidarGrit as the model; .*; lidargrit\.open_model\(NAME\)"):
+        lidargrit.complete(scan, loaded)
+    with pytest.raises(ConfigError, match=r'a LidarGrit as the model; .*; lidargrit\.load\(NAME, "segment"\)'):
+        lidargrit.segment(scan, loaded)
+
+
+def test_points_that_are_masked_or_of_16_bits_are_none_and_numbers():
+    points = np.array([[3.0, 0, 0], [0, 4, 0], [0, 0.5, 5]])
+    mask = [[False] * 3, [True, False, False], [False] * 3]
+    kept = lidargrit.Scan.from_points(np.ma.masked_array(points, mask), bad_points="drop")
+    np.testing.assert_array_equal(kept.points_xyz_m.numpy(), points[[0, 2]])
+    short = lidargrit.Scan.from_points(torch.tensor(points, dtype=torch.bfloat16))
+    np.testing.assert_array_equal(short.points_xyz_m.numpy(), points)
+    with pytest.raises(UnknownNameError, match=r"bad_points='Drop'; wanted .*refuse"):
+        lidargrit.Scan.from_points(points, bad_points="Drop")

@@ -9,25 +9,29 @@ from typing import TypeAlias
 import numpy as np
 from torch import Tensor
 
-from lidargrit.core.errors import DataError, ScanError
+from lidargrit.core.errors import ConfigError, DataError, ScanError
 from lidargrit.data import formats
+from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.run_folder import PACKAGED
 from lidargrit.data.sources import Source, open_source
-from lidargrit.data.sources.memory import MemorySource
+from lidargrit.data.sources.memory import ImagesInMemory, MemorySource
+from lidargrit.data.sources.scan_sensor import other_sensor
 from lidargrit.data.torch_dataset import TorchDataset
 from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair, open_pair, open_reference
 from lidargrit.evaluation.scorecard import Scorecard
-from lidargrit.generation.generator import load
+from lidargrit.generation.generator import Generator, load
 from lidargrit.inference.complete import Model, open_model
 from lidargrit.inference.complete.cloud import CompletedScan
 from lidargrit.inference.complete.tasks import AddRows, Drop, complete_scan
 from lidargrit.inference.segment import open_segmenter
 from lidargrit.inference.segment.points import PointLabels
 from lidargrit.scans.condition import ConditionKind, Observed
-from lidargrit.scans.projection import inspect, unproject
+from lidargrit.scans.projection import inspect as inspect_scan
 from lidargrit.scans.projection import project as project_scan
+from lidargrit.scans.projection import unproject
 from lidargrit.scans.projection.image import ProjectionVariant
+from lidargrit.scans.projection.inspection import Inspection
 from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
@@ -54,6 +58,10 @@ __all__ = [
 
 Points: TypeAlias = Scan | np.ndarray | Tensor
 """A scan, or coordinates of its points in metres as an array (n, 3), or (n, 4) with intensity."""
+Scans: TypeAlias = str | Path | Sequence[Points] | RangeImage
+"""A source of scans by its name or folder, scans in memory, or a batch of range images (B, H, W)."""
+Sensor: TypeAlias = SensorModel | str | Path
+"""A sensor, its name, or its ``.json`` file."""
 _packaged_model, _packaged_segmenter = lru_cache(open_model), lru_cache(open_segmenter)  # each is read once
 
 
@@ -74,7 +82,7 @@ def load_scan(path: str | Path, index: int = 0, bad_points: BadPoints = "refuse"
 
 def project(
     points: Points,
-    sensor: SensorModel | str,
+    sensor: Sensor,
     method: ProjectionName | None = None,
     variant: ProjectionVariant = "exact",
     partial: bool = False,
@@ -83,15 +91,26 @@ def project(
 
     Args:
         points: scan, or its points as an array (n, 3) or (n, 4) in metres.
-        sensor: sensor with the rays of the image, or its name (``lidargrit list sensors``).
+        sensor: sensor with the rays of the image, its name (``lidargrit list sensors``) or its file.
         method, variant, partial: settings of :func:`lidargrit.scans.projection.project`.
     """
-    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    return project_scan(_as_scan(points), sensor, method, variant, partial)
+    return project_scan(_as_scan(points), load_sensor(sensor), method, variant, partial)
+
+
+def inspect(
+    points: Points, sensor: Sensor, method: ProjectionName | None = None, variant: ProjectionVariant = "exact"
+) -> Inspection:
+    """Find what becomes of every point of a scan in its range image, and say what does not fit.
+
+    Args:
+        points: scan, or its points as an array (n, 3) or (n, 4) in metres.
+        sensor, method, variant: arguments of :func:`project`.
+    """
+    return inspect_scan(_as_scan(points), load_sensor(sensor), method, variant)
 
 
 def complete(
-    points: Points, model: str | Path | Model = "pretrained", seed: int = 0, sensor: SensorModel | str | None = None
+    points: Points, model: str | Path | Model = "pretrained", seed: int = 0, sensor: Sensor | None = None
 ) -> CompletedScan:
     """Fill in every ray of a scan that has no point, and keep all points as they are.
 
@@ -112,22 +131,19 @@ def complete(
         whole = lidargrit.complete(points).whole()
         whole.points_xyz_m[~whole.filled]  # the measured points, bit for bit
     """
-    own = load_sensor(sensor) if isinstance(sensor, str) else sensor
+    own = None if sensor is None else load_sensor(sensor)
     return complete_scan(_as_scan(points), _opened(model, "pixels", own), None, seed)
 
 
-def upsample(
-    points: Points, sensor: SensorModel | str, model: str | Path | Model = "pretrained", seed: int = 0
-) -> CompletedScan:
+def upsample(points: Points, sensor: Sensor, model: str | Path | Model = "pretrained", seed: int = 0) -> CompletedScan:
     """Add the rows that a sensor with few of them lacks, and keep all points as they are.
 
     Args:
         points: scan, or its points as an array (n, 3) or (n, 4) in metres.
-        sensor: sensor that made the scan, or its name, such as ``vlp16``.
+        sensor: sensor that made the scan, its name, such as ``vlp16``, or its file.
         model, seed: arguments of :func:`complete`; the model has the rows that are added.
     """
-    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    return complete_scan(_as_scan(points), _opened(model, "pixels"), AddRows(sensor), seed)
+    return complete_scan(_as_scan(points), _opened(model, "pixels"), AddRows(load_sensor(sensor)), seed)
 
 
 def raydrop(points: Points, model: str | Path | Model = "pretrained", seed: int = 0) -> CompletedScan:
@@ -147,12 +163,13 @@ def raydrop(points: Points, model: str | Path | Model = "pretrained", seed: int 
     return complete_scan(_as_scan(points), _opened(model, "surfaces"), Drop(), seed)
 
 
-def segment(points: Points, model: str | Segmenter = "pretrained") -> Scan:
+def segment(points: Points, model: str | Path | Segmenter = "pretrained") -> Scan:
     """Label every point of a scan with its class, by SemanticKITTI's numbers.
 
     Args:
         points: scan, or its points as an array (n, 3), or (n, 4) with intensity, in metres.
-        model: run of a segmenter, or what :func:`load` returned for it; load a run once for many scans.
+        model: run of a segmenter, or what :func:`load` returned for it (``load("pretrained", "segment")``); load a run
+            once for many scans.
 
     Returns:
         the scan with all its points, in their order, and their labels; 0 for points without a return of the range image
@@ -166,39 +183,41 @@ def segment(points: Points, model: str | Segmenter = "pretrained") -> Scan:
         is_car = lidargrit.segment(points).label == 10
     """
     scan = _as_scan(points)
+    if isinstance(model, Generator) and not isinstance(model, Segmenter):
+        raise _other_model(model, 'lidargrit.load(NAME, "segment")')
     segmenter = _packaged_segmenter(PACKAGED[0].name) if model == PACKAGED[0].name else model
-    labels = PointLabels(segmenter if isinstance(segmenter, Segmenter) else open_segmenter(segmenter))
+    labels = PointLabels(segmenter if isinstance(segmenter, Segmenter) else open_segmenter(str(segmenter)))
     return replace(scan, label=labels.of(scan)[0])
 
 
 def evaluate(
-    generated: str | Path | Sequence[Points],
-    reference: str | Path | Sequence[Points],
+    generated: Scans,
+    reference: Scans,
     protocol: str = "exact",
     metrics: Sequence[str] = (),
     max_scans: int = 0,
-    sensor: SensorModel | str = "hdl64e_kitti_odometry",
+    sensor: Sensor = KittiOdometry.sensor,
 ) -> Scorecard:
     """Score a folder of samples, or any scans, against others.
 
     Args:
-        generated: a folder of samples, of ours or of another program, a source of scans, or scans in memory.
+        generated: a folder of samples, of ours or of another program, a source of scans, scans in memory, or range
+            images in memory, such as what :meth:`Generator.sample` returned.
         reference: a set to compare with, of the same kinds; its scans are projected with the sensor of ``generated``.
             Or a reference file (``evaluate DATA --save-reference``).
         protocol: name of the protocol, which chooses and defines the metrics (``lidargrit list protocols``).
         metrics: names of metrics, instead of the protocol's.
         max_scans: largest number of scans of each set; 0 for the protocol's.
-        sensor: sensor of scans in memory, or its name.
+        sensor: sensor of scans in memory, its name or its file; range images have theirs.
 
     Returns:
         scores with intervals, beside those of real scans against real scans: ``card.scores``, or
         ``print(card.as_table())`` for all of them.
     """
     settings = EvalConfig(protocol=protocol, metrics=tuple(metrics), max_scans=max_scans)
-    sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    named = isinstance(reference, (str, Path))
-    real = open_reference(str(reference), settings) if named else _source(reference, sensor)
-    return evaluate_pair(open_pair(_source(generated, sensor), real, settings), settings)
+    named, own = isinstance(reference, (str, Path)), load_sensor(sensor)
+    real = open_reference(str(reference), settings) if named else _source(reference, own)
+    return evaluate_pair(open_pair(_source(generated, own), real, settings), settings)
 
 
 def _as_scan(points: Points) -> Scan:
@@ -207,25 +226,38 @@ def _as_scan(points: Points) -> Scan:
     if isinstance(points, (np.ndarray, Tensor)):
         return Scan.from_points(points)
     wanted = "a Scan, or its points as a NumPy array or torch tensor"
-    raise ScanError(f"points as {type(points).__name__}", wanted, "np.asarray(points), or lidargrit.load_scan(path)")
+    cure = "np.asarray(points), or lidargrit.load_scan(path)"
+    if isinstance(points, RangeImage):
+        cure = "take its points: lidargrit.unproject(image)"
+    raise ScanError(f"points as {type(points).__name__}", wanted, cure)
 
 
-def _source(scans: str | Path | Sequence[Points], sensor: SensorModel) -> Source:
+def _source(scans: Scans, sensor: SensorModel) -> Source:
     if isinstance(scans, (str, Path)):
         return open_source(str(scans))
+    if isinstance(scans, RangeImage):
+        return ImagesInMemory(scans)
     if isinstance(scans, Scan):
         raise DataError("a single scan in place of a set", "several scans", "give them as a list")
     return MemorySource([_as_scan(points) for points in scans], sensor)
 
 
+def _other_model(model: object, cure: str) -> ConfigError:
+    return ConfigError(f"a {type(model).__name__} as the model", "a run's name or folder, or an opened model", cure)
+
+
 def _opened(model: str | Path | Model, kind: ConditionKind, sensor: SensorModel | None = None) -> Model:
     if isinstance(model, Model):
+        if sensor is not None and not model.sensor.same_rays(sensor):
+            raise other_sensor(sensor, model.sensor, model.name)
         return model
+    if not isinstance(model, (str, Path)):
+        raise _other_model(model, "lidargrit.open_model(NAME)")
     packaged = str(model) in {folder.name for folder in PACKAGED}
     return _packaged_model(model, kind) if packaged and sensor is None else open_model(model, kind, sensor)
 
 
-def torch_dataset(source: str, sensor: SensorModel | str | None = None) -> TorchDataset:
+def torch_dataset(source: str | Path, sensor: Sensor | None = None) -> TorchDataset:
     """Return the range images of a source as a data set for torch's loaders.
 
     Args:
@@ -237,4 +269,4 @@ def torch_dataset(source: str, sensor: SensorModel | str | None = None) -> Torch
         >>> dataset[1]["range_m"].shape
         torch.Size([64, 64])
     """
-    return TorchDataset(source, load_sensor(sensor) if isinstance(sensor, str) else sensor)
+    return TorchDataset(str(source), None if sensor is None else load_sensor(sensor))

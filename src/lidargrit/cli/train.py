@@ -32,12 +32,21 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.errors import ConfigError
     from lidargrit.generation.generator import load_class
     from lidargrit.generation.presets import load_preset
-    from lidargrit.training import measure, open_data, plan_training, train, with_best_batches, without_auto
+    from lidargrit.training import (
+        check_folder,
+        measure,
+        open_data,
+        plan_training,
+        train,
+        with_best_batches,
+        without_auto,
+    )
 
     words, automatic = without_auto(scan_words(options))
     preset = with_best_batches(load_preset(options.preset, words), automatic, options.out)
     if options.dry_run or options.measure:
         refuse_taken(options)
+        check_folder(options.out, preset)
         planned = plan_training(preset)
         measured = measure(preset, planned.flops) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])

@@ -370,7 +370,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return generator
 
 
-def load(name: str | Path, job: Job = "sample", device: str = "cpu") -> Generator:
+def load(name: str | Path, job: Job = "sample", device: str = "cpu") -> Generator[Any, Any]:
     """Read a trained generator from a run's folder; ``pretrained`` and ``pretrained_wide`` come with the package.
 
     Args:

@@ -192,7 +192,7 @@ def load_preset(name: str, settings: Sequence[str] = ()) -> Preset:
         )
     is_generator = is_preset(name) and name not in discovery.names("presets")
     found = default_preset(name) if is_generator else discovery.load_instance("presets", name, Preset)
-    return configuration.override(found, settings)
+    return configuration.override(found, settings, f"the preset {name!r}")
 
 
 def is_preset(name: str) -> bool:

@@ -3,14 +3,14 @@
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence, Set
-from typing import Literal, Required, TypeAlias, TypedDict
+from typing import Literal, Required, TypeAlias, TypedDict, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
-from lidargrit.core.errors import ScanError
+from lidargrit.core.errors import ScanError, UnknownNameError, one_of
 from lidargrit.scans.classes import notes_on_labels
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.point_times import TIME_NAMES, point_times
@@ -96,7 +96,7 @@ def parts_of_columns(
         notes=(*notes, *notes_on_labels(label), *told),
         rows=FileRows(columns, np.arange(len(points_xyz_m))),
     )
-    return usable_parts(parts) if bad_points == "drop" else parts
+    return treated_parts(parts, bad_points)
 
 
 def columns_of_arrays(xyz: np.ndarray | Tensor, **values: Values | None) -> dict[str, np.ndarray]:
@@ -119,8 +119,12 @@ def columns_of_arrays(xyz: np.ndarray | Tensor, **values: Values | None) -> dict
     return columns
 
 
-def usable_parts(parts: ScanParts) -> ScanParts:
-    """Return the parts of a scan without points that are no returns, which a note counts."""
+def treated_parts(parts: ScanParts, bad_points: BadPoints) -> ScanParts:
+    """Return the parts of a scan, of ``drop`` without the points that are no returns, which a note counts."""
+    if bad_points not in get_args(BadPoints):
+        raise UnknownNameError(f"bad_points={bad_points!r}", one_of(get_args(BadPoints)), "choose one")
+    if bad_points == "refuse":
+        return parts
     kept = usable_points(parts["points_xyz_m"], parts.get("reflectance"))
     if bool(kept.all()):
         return parts
@@ -168,7 +172,13 @@ def quantity_of(name: str) -> str:
 
 
 def _array(values: Values) -> np.ndarray:
-    found = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+    if isinstance(values, Tensor):
+        values = values.detach().cpu()
+        found = (values.float() if values.dtype == torch.bfloat16 else values).numpy()  # which NumPy does not know
+    elif isinstance(values, np.ma.MaskedArray) and values.mask.any():
+        found = np.ma.filled(values.astype(np.float64), np.nan)  # a masked point is none
+    else:
+        found = np.asarray(values)
     if found.dtype.kind not in "fiu":
         raise ScanError(f"values of type {found.dtype}", "numbers", "convert them, e.g. by .astype(np.float32)")
     return found

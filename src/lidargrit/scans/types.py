@@ -143,7 +143,8 @@ class Scan:
             raise ScanError(
                 f"{int(bad.sum())} of {len(self)} points {what} in {self.source}",
                 wanted,
-                "remove these points, or drop them by --bad-points drop (in Python: bad_points='drop')",
+                "remove these points, or drop them by --bad-points drop (in Python: Scan.from_points(points, "
+                "bad_points='drop'))",
             )
 
     def __len__(self) -> int:

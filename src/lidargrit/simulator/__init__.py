@@ -4,6 +4,7 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -41,7 +42,7 @@ _DEFAULT = "hdl64e_kitti_odometry"
 
 def simulate(
     seed: int,
-    sensor: SensorModel | None = None,
+    sensor: SensorModel | str | Path | None = None,
     *,
     theme: Theme = "mixed",
     frame: int = 0,
@@ -59,7 +60,8 @@ def simulate(
 
     Args:
         seed: seed of the street and of the noise, 0 or more; the same seed gives the same scan, bit for bit.
-        sensor: sensor to simulate, with every column that it fires; the HDL-64E of KITTI odometry if not given.
+        sensor: sensor to simulate, its name or its file, with every column that it fires; the HDL-64E of KITTI odometry
+            if not given.
         theme: kind of street.
         frame: index of the revolution, 0.1 s apart; the frames of one seed are a drive through one street.
         frames: number of the drive's frames that are wanted; 1 for as many as it takes to get to ``frame``. A street of
@@ -102,7 +104,7 @@ def simulate(
 
 def observe(
     seed: int,
-    sensor: SensorModel | None = None,
+    sensor: SensorModel | str | Path | None = None,
     *,
     theme: Theme = "mixed",
     frame: int = 0,
@@ -121,7 +123,7 @@ def observe(
     """
     check_settings(seed, theme, frame, wet)
     check_settings(seed, theme, frames - 1)
-    sensor = sensor or load_sensor(_DEFAULT)
+    sensor = load_sensor(sensor or _DEFAULT)
     # Children of a seed: 0 is the street's, and each frame has one.
     beam_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(frame + 1,)))
     config = ObservationConfig(FRAME_S * frame, motion, wet, kept_columns_only, model)

@@ -1,5 +1,6 @@
 """A user's scans → the preset that trains the networks of the package further on them."""
 
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,7 +20,7 @@ _TIMES_OF_DEMO = 10  # as many scans seen as the demo's preset says, where there
 _ENOUGH_SCANS = 400  # for all of these; fewer scans are seen in proportion, but no fewer than the demo's preset says
 
 
-def divided(data: str, max_scans: int = 0, if_few: str = "add scans") -> DataConfig:
+def divided(data: str, max_scans: int = 0, if_few: str = "add scans", sensor: str = "") -> DataConfig:
     """Divide a user's scans into train and val, by whole drives where there are several.
 
     The same drive in both would leak. Held out is the drive that is nearest to 15 % of the scans; where there is only
@@ -28,6 +29,7 @@ def divided(data: str, max_scans: int = 0, if_few: str = "add scans") -> DataCon
     Args:
         data: name of a data set, or of a folder of scans.
         if_few: cure of too few scans.
+        sensor: name or file of the sensor that made the scans; that of the data set if empty.
     """
     opened = open_source(data)
     dataset = opened.scans()
@@ -50,14 +52,14 @@ def divided(data: str, max_scans: int = 0, if_few: str = "add scans") -> DataCon
             "WARNING: the last scans are held out; if they are of the same drive, they show the same streets"
         )
         train, val = f"{source}:{split}[:85%]", f"{source}:{split}[85%:]"
-    return DataConfig(train=(train,), val=(val,), sensor=opened.sensor_name, max_scans=max_scans)
+    return DataConfig(train=(train,), val=(val,), sensor=sensor or opened.sensor_name, max_scans=max_scans)
 
 
-def _all_to_train(data: str, val: str) -> DataConfig:
+def _all_to_train(data: str, val: str, sensor: str) -> DataConfig:
     train, held_out = (open_source(source) for source in (data, val))
     train.scans()
     held_out.scans()  # refused now, not after the first stage
-    return DataConfig(train=(data,), val=(val,), sensor=train.sensor_name)
+    return DataConfig(train=(data,), val=(val,), sensor=sensor or train.sensor_name)
 
 
 def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = (), val: str = "") -> Preset:
@@ -73,18 +75,19 @@ def fine_tuning_preset(data: str, sensor: str = "", settings: Sequence[str] = ()
         settings: changed settings of the preset, as ``--set`` takes them.
         val: scans to validate on; some of the scans are held out if empty.
     """
-    config = _all_to_train(data, val) if val else divided(data, if_few="add scans, or name others with --val")
-    own, made_by = read_config(locate(PRETRAINED)).sensor, load_sensor(sensor or config.sensor)
+    few = "add scans, or name others with --val"
+    config = _all_to_train(data, val, sensor) if val else divided(data, if_few=few, sensor=sensor)
+    own, made_by = read_config(locate(PRETRAINED)).sensor, load_sensor(config.sensor)
     columns, stride = columns_like(own, made_by)
     if made_by.height != own.height:
-        of = f"data.sensor={sensor or config.sensor} data.columns={columns} data.column_stride={stride}"
+        of = f"data.sensor={config.sensor} data.columns={columns} data.column_stride={stride}"
         raise ConfigError(
             f"scans of {made_by.height} rows, of the sensor {made_by.name!r}",
             f"{own.height} rows: the networks of the package have weights for every row",
-            f"train new ones: lidargrit train lidargrit_small OUT --set {of} data.train={config.train[0]} "
-            f"data.val={config.val[0]}",
+            f"train new ones: lidargrit train lidargrit_small OUT --set {of} "
+            + shlex.join([f"data.train={config.train[0]}", f"data.val={config.val[0]}"]),
         )
-    config = replace(config, sensor=sensor or config.sensor, columns=columns, column_stride=stride)
+    config = replace(config, columns=columns, column_stride=stride)
     preset = replace(load_preset(_PRESET), title="networks of the package, trained further", data=config)
     count = sum(len(open_source(source).scans()) for source in config.train)
     times = min(_TIMES_OF_DEMO, max(1, round(_TIMES_OF_DEMO * count / _ENOUGH_SCANS)))

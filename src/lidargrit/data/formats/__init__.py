@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lidargrit.core import discovery
 from lidargrit.core.errors import OutputError, ScanError, first_words
-from lidargrit.scans.columns import BadPoints, ScanParts, usable_parts
+from lidargrit.scans.columns import BadPoints, ScanParts, treated_parts
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.types import Scan
 
@@ -264,7 +264,7 @@ def scan_of(
         rows=rows,
         point_time_s=point_time_s,
     )
-    return Scan(**(usable_parts(parts) if bad_points == "drop" else parts), source=source)
+    return Scan(**treated_parts(parts, bad_points), source=source)
 
 
 def open_file(path: Path, wanted: str) -> BufferedReader:

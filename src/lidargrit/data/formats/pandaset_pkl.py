@@ -15,7 +15,7 @@ from lidargrit.core.errors import DataError, ScanError
 from lidargrit.core.files import read_json, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, read_bytes
 from lidargrit.data.formats.shared.pandas_pickle import columns_of_table
-from lidargrit.scans.columns import ScanParts, usable_parts
+from lidargrit.scans.columns import ScanParts, treated_parts
 from lidargrit.scans.motion import Trajectory
 from lidargrit.scans.types import Scan
 
@@ -84,7 +84,7 @@ class PandasetPkl(ScanFormat):
             parts["label"] = torch.from_numpy(classes[own].astype(np.int64))
         before = float((times_s < drive.times_s[0]).mean())
         note = f"{before:.0%} of the points are from before the first pose of the drive: rows may lie off"
-        scan = Scan(**(usable_parts(parts) if bad_points == "drop" else parts), source=str(path))
+        scan = Scan(**treated_parts(parts, bad_points), source=str(path))
         return replace(scan, notes=(*scan.notes, note)) if before > _BEFORE_AT_MOST else scan
 
     @staticmethod

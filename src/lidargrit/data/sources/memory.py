@@ -10,7 +10,8 @@ from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources.source import Source
-from lidargrit.scans.projection import project_by_what_fits
+from lidargrit.scans.projection import project_by_what_fits, projection_that_fits
+from lidargrit.scans.projection.sensor_check import told_doubts
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
@@ -40,8 +41,35 @@ class MemorySource(Source):
     def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
         """Project the scans, or so many of them, evenly spaced."""
         config = config or DataConfig()
-        self.projection_variant = config.projection_variant
-        return _imaged(self._scans.__getitem__, len(self._scans), sensor or self.sensor, config, Provenance())
+        self.projection_variant, first, rays = config.projection_variant, self._scans[0], sensor or self.sensor
+        found = told_doubts(first, rays, projection_that_fits(first, rays), self.text)
+        self.doubts = tuple(dict.fromkeys((*self.doubts, *filter(None, found))))
+        return _imaged(self._scans.__getitem__, len(self._scans), rays, config, Provenance())
+
+
+class ImagesInMemory(Source):
+    """Range images that a caller holds, such as samples of a generator.
+
+    Args:
+        images: batch of images (B, H, W).
+    """
+
+    kind, data_set = "range images in memory", "samples"
+
+    def __init__(self, images: RangeImage) -> None:
+        batch = RangeImage.stack([images]) if images.range_m.ndim == 2 else images
+        super().__init__(f"{len(batch)} range images in memory")
+        self._batch = batch.to("cpu")
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the images."""
+        return self._batch.sensor
+
+    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+        """Return the images, or so many of them, evenly spaced."""
+        chosen = evenly_spaced((config or DataConfig()).max_scans or len(self._batch), len(self._batch))
+        return RangeImages(self.sensor, [_Images([self._batch[index] for index in chosen], Provenance())])
 
 
 class CutSource(Source):

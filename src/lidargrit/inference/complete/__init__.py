@@ -7,7 +7,7 @@ from typing import Any
 
 from lidargrit.core import configuration
 from lidargrit.core.configuration import name_and_settings
-from lidargrit.core.errors import ConfigError, nearest_names
+from lidargrit.core.errors import ConfigError, UnknownNameError, nearest_names, one_of
 from lidargrit.data.images import Provenance
 from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant, takes_any_sensor, trained_on
 from lidargrit.data.sources.scan_sensor import other_sensor
@@ -91,6 +91,8 @@ def open_model(
         ConfigError: a run that cannot complete such scans, or one of another sensor than the named one.
     """
     word = str(word)
+    if kind not in KINDS:
+        raise UnknownNameError(f"the kind of conditions {kind!r}", one_of(KINDS), "choose one")
     if is_classical(word):
         if kind != "pixels":
             got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"

@@ -1,5 +1,6 @@
 """What a model can do with a scan: fill it in, add rows between its own, or drop returns of a clean one."""
 
+import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -184,6 +185,8 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
     check_seeds([seed])
     task = task or Fill(Pattern("returns"))
     seen = task.see(scan, model)
+    if seen.doubt:
+        warnings.warn(seen.doubt, stacklevel=3)  # at whoever called the function of the Python API
     seeds = seen.rays.seeds(seed)
     condition = seen.rays.beside_one_another(task.condition(seen, derive_seed(seed)), seeds)
     return task.result(seen, condition, complete_images(model, condition, seeds))

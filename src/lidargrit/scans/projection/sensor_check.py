@@ -45,7 +45,7 @@ _EMPTY_BETWEEN_AT_MOST, _COLUMNS_AROUND = 0.2, 3
 _RINGS_OFF_AT_MOST_DEG = 2.0  # of a sensor that may be the scan's: in the mean over its rows
 _FEW_POINTS = 0.02  # of what a row has in the median: a stray point does not fill a row
 
-_BY_ELEVATION = "project by elevation: --projection spherical (in Python: method='spherical')"
+_BY_ELEVATION = "project by elevation: --projection spherical (in Python: method='spherical' of project)"
 _NAME_IT = "name the sensor that made the scan with --sensor"
 FIT_SENSOR = "or find yours with lidargrit fit-sensor, and name its file in place of a sensor"
 

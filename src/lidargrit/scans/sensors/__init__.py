@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import torch
@@ -185,14 +186,17 @@ def _setup_of(data: Any) -> SensorSetup:
         raise ConfigError(got, wanted, "correct the set-up, or leave it out") from None
 
 
-def load_sensor(name: str) -> SensorModel:
+def load_sensor(name: str | Path | SensorModel) -> SensorModel:
     """Return a sensor by its name ("hdl64e_kitti_360", ...), from a ``.json`` file, or the drawn one of a seed
-    ("drawn_7").
+    ("drawn_7"); a sensor as it is.
 
     Raises:
         UnknownNameError: no sensor of that name; names its nearest neighbours.
         ConfigError: the file cannot be read, or does not hold a sensor.
     """
+    if isinstance(name, SensorModel):
+        return name
+    name = str(name)
     if name.startswith(_DRAWN) and name.removeprefix(_DRAWN).isdecimal():
         from lidargrit.scans.drawn_sensors import drawn_sensor  # noqa: PLC0415  which shifts sensors that are loaded here
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lidargrit.core import reporting
 from lidargrit.core.configuration import Settings
 from lidargrit.core.determinism import evenly_spaced, scan_seed
 from lidargrit.core.errors import ConfigError
@@ -21,6 +22,7 @@ from lidargrit.generation.generator import Generator
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_values import decode, encode
 from lidargrit.nn.flops import flops_of
+from lidargrit.nn.precision import inference
 from lidargrit.nn.random import SeededNoise
 from lidargrit.scans.condition import Condition, Observed
 from lidargrit.scans.example import Example
@@ -138,9 +140,11 @@ class R2dm(Generator[R2dmConfig, DiffusionSampling]):
         seeds = [scan_seed(_CALIBRATION_SEED, number) for number in range(self.config.calibration_scans)]
         if not seeds or not bool(self.return_share.isfinite()):
             return
-        parts = [
-            self._sample_values(seeds[first : first + _BATCH], _CALIBRATION) for first in range(0, len(seeds), _BATCH)
-        ]
+        parts = list[Tensor]()
+        with inference(), reporting.progress("calibrating raydrop", len(seeds)) as progress:
+            for first in range(0, len(seeds), _BATCH):
+                parts.append(self._sample_values(seeds[first : first + _BATCH], _CALIBRATION))
+                progress.advance(len(parts[-1]))
         levels = torch.cat([part[:, 0].flatten() for part in parts]).sort().values
         dropped = min(round((1 - float(self.return_share)) * len(levels)), len(levels) - 1)
         self.return_threshold.fill_(float(levels[dropped]))
