@@ -29,29 +29,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from lidargrit import training
     from lidargrit.core.errors import ConfigError
     from lidargrit.generation.generator import load_class
     from lidargrit.generation.presets import load_preset
-    from lidargrit.training import (
-        check_folder,
-        measure,
-        open_data,
-        plan_training,
-        train,
-        with_best_batches,
-        without_auto,
-    )
 
-    words, automatic = without_auto(scan_words(options))
-    preset = with_best_batches(load_preset(options.preset, words), automatic, options.out)
+    words, automatic = training.without_auto(scan_words(options))
+    preset = training.with_best_batches(load_preset(options.preset, words), automatic, options.out)
     if options.dry_run or options.measure:
         refuse_taken(options)
-        check_folder(options.out, preset)
-        planned = plan_training(preset)
-        measured = measure(preset, planned.flops) if options.measure else []
+        training.check_folder(options.out, preset)
+        planned = training.plan_training(preset)
+        measured = training.measure(preset, planned.flops) if options.measure else []
         text = "\n".join([planned.as_text(), *(stage.as_text() for stage in measured)])
         print_result(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
-        open_data(preset)  # last: the plan of a preset is worth reading on a machine without its data too
+        training.open_data(preset)  # last: the plan of a preset is worth reading on a machine without its data too
         return
     if options.json:
         raise ConfigError(
@@ -59,6 +51,6 @@ def run(options: argparse.Namespace) -> None:
         )
     from lidargrit.viewer import plot_progress  # matplotlib, which a plan does not need
 
-    train(preset, options.out, plot_progress, options.wandb)
+    training.train(preset, options.out, plot_progress, options.wandb)
     command = load_class(preset.generator).facts.first_command.replace("RUN", str(options.out))
     print(f"done: the model lies in {options.out}; try it with: lidargrit {command}")

@@ -46,7 +46,7 @@ class ScanIdentity(NamedTuple):
     """What identifies a scan, so that neither another one nor a changed one is taken for it.
 
     Args:
-        name: its name in its source, or how it was made.
+        name: name of the scan in its source, or words that say how it was made.
         state: sizes and times of the files that hold it; "" where none are known.
     """
 

@@ -33,7 +33,7 @@ def untold(notes: Iterable[str], told: set[str]) -> list[str]:
     """Return the notes that differ from one another, and from those that were told, in more than numbers.
 
     Args:
-        told: what was told so far, without its numbers; the notes are added to it.
+        told: notes that were told so far, without their numbers; the new ones are added.
     """
     new = list[str]()
     for note in notes:
