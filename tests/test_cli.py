@@ -112,6 +112,8 @@ def test_dry_run_tells_the_plan_and_writes_nothing(tmp_path, typed):
     for line in ("training.tokenizer.scans = 8", "range images of 64x64, 0.", "transformer: ", "8 scans in batches of"):
         assert line in output
     assert not (tmp_path / "none").exists()
+    (tmp_path / "mine.txt").touch()
+    assert main(["train", "lidargrit_demo", str(tmp_path), "--dry-run"]) == 2, "as the training would"
 
 
 @pytest.mark.parametrize("data", ["data.train=gone/scans", "data.val=simulated:2:val,gone/scans"])

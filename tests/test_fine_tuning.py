@@ -1,6 +1,7 @@
 """The networks of the package, trained further on a user's scans by one verb."""
 
 import json
+import shlex
 
 import pytest
 import torch
@@ -54,7 +55,7 @@ def test_images_of_another_sensor_of_64_rows_are_as_wide_as_the_models():
 def test_scans_of_other_rows_are_refused_with_a_command_that_plans_a_training(sensor, capsys):
     with pytest.raises(ConfigError, match=f"scans of {load_sensor(sensor).height} rows") as refused:
         fine_tuning_preset("simulated:8:train", sensor)
-    typed = refused.value.cure.partition("lidargrit ")[2].split()
+    typed = shlex.split(refused.value.cure.partition("lidargrit ")[2])
     assert main([*typed, "--dry-run"]) == 0, capsys.readouterr().err
     assert f"range images of {load_sensor(sensor).height}x256" in capsys.readouterr().out
 
@@ -78,6 +79,14 @@ def test_the_verb_tells_the_time_trains_all_stages(scans, tmp_path, capsys, monk
         assert any(not torch.equal(old, new) for old, new in pairs), f"{stage} was trained"
     training = json.loads((out / "run.json").read_text())["preset"]["training"]
     assert {stage: config["start"] for stage, config in training.items()} == dict.fromkeys(after.stages, "pretrained")
+
+
+@pytest.mark.parametrize("val", [[], ["--val", "simulated:1:val"]])
+def test_a_named_sensor_is_not_looked_for(scans, capsys, val):
+    assert main(["fine-tune", str(scans), str(scans.parent / "out"), "--sensor", "vlp16", *val]) == 2
+    told = capsys.readouterr().err
+    assert "of the sensor 'vlp16'" in told
+    assert "no sensor is named" not in told
 
 
 def test_too_few_scans_are_refused_in_one_line(tmp_path, capsys):
