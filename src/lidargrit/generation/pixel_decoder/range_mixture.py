@@ -6,7 +6,7 @@ from functools import cache
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 
@@ -45,6 +45,10 @@ class RangeMixture:
     centres: Float[Tensor, "*P K"]
     log_scales: Float[Tensor, "*P K"]
     limits_m: tuple[float, float]
+
+    def at(self, pixels: Bool[Tensor, "*P"]) -> "RangeMixture":
+        """Return the distributions of some pixels, one after the other."""
+        return RangeMixture(self.logits[pixels], self.centres[pixels], self.log_scales[pixels], self.limits_m)
 
     def without_last(self) -> "RangeMixture":
         """Return the distributions of all components but the last."""

@@ -92,7 +92,7 @@ def open_model(
     """
     word = str(word)
     if kind not in KINDS:
-        raise UnknownNameError(f"the kind of conditions {kind!r}", one_of(KINDS), "choose one")
+        raise UnknownNameError(f"the kind of conditions {kind!r}", one_of([*KINDS]), "choose one")
     if is_classical(word):
         if kind != "pixels":
             got = f"--model {word}, a classical method, which takes {KINDS['pixels']}"
