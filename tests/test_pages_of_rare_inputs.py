@@ -1,4 +1,4 @@
-"""Pages in a browser, with inputs that are rare: a sensor of one row, and a file that changes after it was chosen."""
+"""Pages in a browser, with inputs that are rare: a sensor of one row, points without a pixel, a file that changes."""
 
 import os
 from dataclasses import replace
@@ -8,7 +8,7 @@ import torch
 import lidargrit
 from lidargrit.data.formats import load
 from lidargrit.scans.sensors import load_sensor
-from lidargrit.scans.types import RangeImage
+from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.viewer.interactive import write_page
 from lidargrit.viewer.scan_sets import ScanSet
 from served import running
@@ -26,6 +26,20 @@ def test_a_sensor_of_one_row_is_coloured_by_its_row(browser, tmp_path):
     browser.settle()
     assert browser.run("document.querySelector('#legend').textContent").startswith("top row")
     assert browser.troubles() == []
+
+
+def test_a_mark_on_a_point_that_the_next_scan_does_not_have_goes_away(browser, tmp_path):
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(256)
+    images = RangeImage(torch.full((2, 64, 256), 9.0), torch.ones(2, 64, 256, dtype=torch.bool), sensor)
+    beside = Scan(torch.tensor([[5.0, 0.0, 3.0], [6.0, 0.0, 3.0]]))
+    write_page([ScanSet("two", images, ("a", "b"), beside=(beside, None))], tmp_path / "page.html")
+    browser.open(tmp_path / "page.html")
+    browser.run("page.mark(page.panes[0], page.panes[0].source.size + 1)")
+    browser.press("ArrowRight")
+    browser.settle()
+    assert browser.troubles() == []
+    assert browser.run("document.querySelector('#panes').getAttribute('aria-busy')") == "false"
+    assert browser.run("document.querySelector('[data-part=readout]').textContent") == ""
 
 
 def test_a_file_that_changed_after_it_was_chosen_is_told_apart_from_a_dead_server(browser, tmp_path):

@@ -181,6 +181,16 @@ def test_an_example_is_one_click_away(example, panes, opened):
         assert "lidargrit " not in said(opened)
 
 
+def test_scans_without_labels_are_not_coloured_by_those_that_were_shown_before(opened):
+    opened.click("#generate")
+    finish(opened)
+    opened.run("desk.page.colourBy('label')")  # as the page does where a scan was labelled
+    opened.click("#generate")
+    finish(opened)
+    assert opened.run("document.querySelector('#mode').value") == "height"
+    assert opened.run("[...document.querySelectorAll('[data-part=missing]')].every((one) => !one.textContent)")
+
+
 def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opened):
     fill(opened, "#model", "2")
     assert opened.run("document.querySelector('[name=steps]').placeholder") == "256"

@@ -123,6 +123,9 @@ def test_messages_of_tasks_name_no_option_of_the_command_line(tmp_path):
     with pytest.raises(ScanError, match=r"^got mine\.ply without a return outside the part to fill in") as refused:
         compute_result(made("lidargrit")[0], request)
     assert "--" not in str(refused.value)
+    (tmp_path / "none.csv").write_text("x,y,z\n0,0,0\n")  # the origin is no return
+    with pytest.raises(ScanError, match=r"^got no point in mine\.csv; wanted a full revolution; take another scan$"):
+        compute_result(made("lidargrit")[0], replace(request, file=str(tmp_path / "none.csv"), name="mine.csv"))
 
 
 def test_a_scan_is_labelled_by_the_segmenter_beside_a_model(scan_file, tmp_path, monkeypatch):

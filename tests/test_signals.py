@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: one line and an exit code, whenever they come."""
+"""Ctrl-C, SIGTERM and SIGHUP: one line and an exit code, whenever they come."""
 
 import os
 import signal
@@ -13,15 +13,17 @@ import pytest
 from lidargrit.cli._signals import raising_on_signals
 from lidargrit.core.errors import Terminated
 
-SIGNALS = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
+SIGNALS = {signal.SIGTERM: Terminated, signal.SIGHUP: Terminated, signal.SIGINT: KeyboardInterrupt}
 
 
 @pytest.fixture(autouse=True)
 def _heard():
-    """Let Ctrl-C be heard: where the tests run in the background of a shell, it is ignored from the start."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Let signals be heard: where the tests run in the background of a shell, some are ignored from the start."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGHUP: signal.SIG_DFL}
+    befores = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, before in befores.items():
+        signal.signal(number, before)
 
 
 def interrupted(action: Callable[[], object]) -> None:
@@ -61,13 +63,11 @@ def test_elsewhere_it_is_raised_at_once(number):
         interrupted(lambda: os.kill(os.getpid(), number))
 
 
-def test_an_ignored_interrupt_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with raising_on_signals():
-            os.kill(os.getpid(), signal.SIGINT)
-    finally:
-        signal.signal(signal.SIGINT, before)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])  # in the background of a script, and under nohup
+def test_an_ignored_signal_stays_ignored(number):
+    signal.signal(number, signal.SIG_IGN)
+    with raising_on_signals():
+        os.kill(os.getpid(), number)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM → KeyboardInterrupt and Terminated, never in the middle of an import."""
+"""Ctrl-C, SIGTERM and SIGHUP → KeyboardInterrupt and Terminated, never in the middle of an import."""
 
 import signal
 from collections.abc import Iterator
@@ -16,12 +16,16 @@ _AGAIN_S = 0.05
 def raising_on_signals() -> Iterator[None]:
     """Let SIGTERM, which batch schedulers send before they kill, end a verb as Ctrl-C does: with its files in order.
 
+    So does SIGHUP, which a terminal that closes and a connection that breaks send, unless it is ignored, as by nohup.
+
     A module that an exception leaves half imported fails later, with an error that hides the signal. So a signal that
     comes during an import is raised as soon as the import is done, or else at the end of the ``with`` block.
     """
     raised: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # ignored in the background of a script
         raised[signal.SIGINT] = KeyboardInterrupt
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        raised[signal.SIGHUP] = Terminated
     befores: dict[int, Any] = {}
     waiting: list[int] = []  # came during an import
 

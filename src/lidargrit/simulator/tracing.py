@@ -172,22 +172,20 @@ class Tracer:
         directions: Float32[np.ndarray, "n 3"],
         first: Hits,
         passes: Float32[np.ndarray, " t"],
-        at_most: int = 2,
     ) -> tuple[Hits, Float32[np.ndarray, " n"]]:
-        """Follow rays that met a pane to what stands behind it, through a few panes at most.
+        """Follow rays that met a pane to what stands behind it, through two panes at most: the windows of a car.
 
         Args:
             directions: unit direction vectors of the rays.
             first: first hit of each ray; a ray that hits no glass ends there.
             passes: share of light that passes each triangle; the last entry is for NOTHING.
-            at_most: largest number of panes that a ray passes; 2 for the two windows of a car.
 
         Returns:
             what each meets last, with the range from its origin, and the share of its light that gets there and back.
         """
         range_m, triangle, cos = first.range_m.copy(), first.triangle.copy(), first.cos_incidence.copy()
         light = np.ones(len(range_m), np.float32)
-        for _ in range(at_most):
+        for _ in range(2):
             on = np.flatnonzero(passes[triangle] > 0)
             if len(on) == 0:
                 break

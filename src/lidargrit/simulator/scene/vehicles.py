@@ -179,7 +179,7 @@ def vehicle_shape(kind: int, variant: int) -> Shape:
     return builder.build()
 
 
-def sample_vehicle_kinds(rng: np.random.Generator, count: int, large: float = 0.03) -> Int[np.ndarray, " n"]:
+def sample_vehicle_kinds(rng: np.random.Generator, count: int, large: float) -> Int[np.ndarray, " n"]:
     """Sample what kinds of vehicle stand or drive in a European street; ``large`` is the share of lorries and buses."""
     shares = np.array(SHARES) * (1 - large)
     shares[[LORRY, BUS]] = 0.6 * large, 0.4 * large

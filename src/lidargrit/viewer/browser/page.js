@@ -178,7 +178,7 @@ class Page {
     }
     if (this.index === index) {
       this.paint();
-      this.panes.forEach((pane) => pane.mark(pane.marked ?? -1));
+      this.panes.forEach((pane) => pane.mark(pane.marked));
       this.area.setAttribute("aria-busy", "false");
     }
   }

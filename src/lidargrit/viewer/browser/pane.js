@@ -90,6 +90,7 @@ class Pane {
       return; // somebody has stepped on meanwhile
     }
     this.scan = scan;
+    this.marked = this.marked < this.source.size ? this.marked : -1; // another scan has other points without a pixel
     this.points = pointsOf(this.source, this.scan);
     this.fresh = true; // points and colours are rendered together, once all panes have theirs
     const number = this.source.scanIndex(index) + 1;
@@ -160,7 +161,7 @@ class Pane {
 
   moveMarks() {
     const { cloud, image, cloudMark, imageMark } = this.part;
-    const pixel = this.marked ?? -1;
+    const pixel = this.marked;
     const matrix = this.page.camera.matrix(cloud.clientWidth / cloud.clientHeight);
     const seen = pixel < 0 ? null : onScreen(matrix, this.points, pixel, cloud.clientWidth, cloud.clientHeight);
     const inside = seen && seen[0] > 0 && seen[1] > 0 && seen[0] < cloud.clientWidth && seen[1] < cloud.clientHeight;

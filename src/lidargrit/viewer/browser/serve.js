@@ -274,8 +274,11 @@ class Desk {
       const shown = Object.assign(new Source(source), { name: name ?? source.name });
       return new ServedPane(shown, this.page, job, group, data.scales);
     });
+    const has = (name) => data.sources.some((source) => source.scans.some((scan) => scan[name]));
     if (data.sources.some((source) => source.name === "labelled")) {
       this.page.colourBy("label");
+    } else if (this.page.control.mode.value === "label" && !has("label")) {
+      this.page.colourBy(has("filled") ? "filled" : "height"); // by labels, which these lack, all of them were grey
     }
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
     fresh.at(-1).element.scrollIntoView({ block: "nearest" }); // on a small screen the form lies below

@@ -195,6 +195,7 @@ def _read_scan(request: SampleRequest, generator: Generator, reader: ScanReader)
             scan = formats.read_scan(path, bad_points="drop")
         scan = dataclasses.replace(scan, source=request.name)
     except LidarGritError as error:
+        error = error.as_left_out() if isinstance(error, ScanError) else error  # there is no option to leave it out
         parts = [
             part.replace(str(path), request.name).replace(path.name, request.name)
             for part in (error.got, error.wanted, error.cure)
