@@ -47,13 +47,13 @@ def test_damaged_files_are_refused(tmp_path):
 
 @pytest.mark.parametrize("line", [b"", b'["a"', b"{}\nx", b'["a", "b"]\nx', b"[" * 20000, b"[1, 2, 3]\nx"])
 def test_a_damaged_scan_beside_an_unfinished_file_is_told_in_one_line(tmp_path, line):
-    with pytest.raises(KeyboardInterrupt), writing(tmp_path / "scans.lgz", {}) as writer:
+    path = tmp_path / "scans.lgz"
+    with suppress(KeyboardInterrupt), writing(path, {}) as writer:
         add_scan(writer.folder, 0, ("one", "one", 5), b"x")
         raise KeyboardInterrupt
-    (writer.folder / "0").write_bytes(line)
-    with pytest.raises(OutputError, match="remove it, and give the same command again"):  # noqa: PT012
-        with writing(tmp_path / "scans.lgz", {}) as again:
-            again.missing(["one"])
+    (tmp_path / "scans.lgz.unfinished" / "0").write_bytes(line)
+    with pytest.raises(OutputError, match="remove it, and give the same command again"), writing(path, {}) as again:
+        again.missing(["one"])
 
 
 def archive_of(names: object, scans: dict[str, bytes], header: bytes = b'{"format": 3}', method: int = 0) -> bytes:
