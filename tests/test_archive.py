@@ -45,6 +45,17 @@ def test_damaged_files_are_refused(tmp_path):
             Archive(path)
 
 
+@pytest.mark.parametrize("line", [b"", b'["a"', b"{}\nx", b'["a", "b"]\nx', b"[" * 20000, b"[1, 2, 3]\nx"])
+def test_a_damaged_scan_beside_an_unfinished_file_is_told_in_one_line(tmp_path, line):
+    path = tmp_path / "scans.lgz"
+    with suppress(KeyboardInterrupt), writing(path, {}) as writer:
+        add_scan(writer.folder, 0, ("one", "one", 5), b"x")
+        raise KeyboardInterrupt
+    (tmp_path / "scans.lgz.unfinished" / "0").write_bytes(line)
+    with pytest.raises(OutputError, match="remove it, and give the same command again"), writing(path, {}) as again:
+        again.missing(["one"])
+
+
 def archive_of(names: object, scans: dict[str, bytes], header: bytes = b'{"format": 3}', method: int = 0) -> bytes:
     """Return a file whose checksums hold, whatever it says."""
     buffer = io.BytesIO()

@@ -3,9 +3,12 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from lidargrit.data.images import RangeImages
+from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.sources import open_source
 from lidargrit.evaluation import compare
 from lidargrit.evaluation.compare import run as run_comparison
 from lidargrit.evaluation.evaluate import EvalConfig
@@ -61,6 +64,25 @@ def test_scores_are_computed_again_for_other_reflectance_on_the_same_ranges(tmp_
         return json.loads((tmp_path / "scores.json").read_text())["scores"][0]["value"]
 
     assert [scored(of) for of in (0.5, 0.9)] == [0, 1]
+
+
+def test_labels_that_alone_changed_are_scored_against_again(tmp_path):
+    """Prepared sets are known by hashes of ranges and reflectance, of which labels are no part."""
+    sequence = tmp_path / "scans" / "sequences" / "00"
+    (sequence / "velodyne").mkdir(parents=True)
+    (sequence / "labels").mkdir()
+    for at, cloud in enumerate(np.random.default_rng(0).normal(0, 9, (2, 500, 4)).astype(np.float32)):
+        (cloud * [1, 1, 0.1, 0]).astype(np.float32).tofile(sequence / "velodyne" / f"{at:06d}.bin")
+    records = []
+    for label in (40, 48, 0):
+        for at in range(2):
+            np.full(500, label, np.uint32).tofile(sequence / "labels" / f"{at:06d}.label")
+        config = DataConfig(sensor="vlp16", columns=32, workers=1)
+        images = open_source(f"kitti_odometry:{sequence.parent.parent}").images(SENSOR, config)
+        records.append(EvalSet("scans", images, range(2)).record())
+    assert len({record.sha256 for record in records}) == 1
+    assert len({record.labels_sha256 for record in records}) == 3
+    assert records[0] != records[1]
 
 
 def test_a_few_samples_are_those_of_the_first_seeds(tmp_path):

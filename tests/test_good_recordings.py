@@ -95,6 +95,16 @@ def test_clouds_whose_header_errs_are_read(tmp_path, changed):
     assert len(scan.notes) == ("big" in changed or changed.get("fields", [("x",)])[0][0] == "time")
 
 
+@pytest.mark.parametrize("gap_of_last", [5, 0], ids=["after each row", "not after the last"])
+def test_gaps_between_rows_are_no_points(tmp_path, gap_of_last):
+    rows = rows_of(TABLE | {"intensity": TABLE["intensity"].astype(np.float32)})
+    width = len(rows) // 2
+    data = (b"\xaa" * 5).join([rows[:width].tobytes(), rows[width : 2 * width].tobytes()]) + b"\xaa" * gap_of_last
+    changed = {"height": 2, "width": width, "row_step": width * rows.dtype.itemsize + 5}
+    scan = read_scan(mcap(tmp_path / "a.mcap", [("/top", message(data=data, **changed))]))
+    assert is_right(scan, {name: column[: 2 * width] for name, column in TABLE.items()})
+
+
 def test_fewer_bytes_than_points_are_damage(tmp_path):
     path = mcap(tmp_path / "a.mcap", [("/top", message(width=len(TABLE["x"]) + 1))])
     with pytest.raises(ScanError, match="damaged file"):

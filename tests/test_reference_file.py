@@ -13,6 +13,7 @@ from lidargrit import api
 from lidargrit.cli import main
 from lidargrit.core.arrays import read_arrays
 from lidargrit.core.errors import ConfigError, DataError, LidarGritError
+from lidargrit.core.files import sha256_of_json
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.evaluation import reference_file as module
 from lidargrit.evaluation.evaluate import EvalConfig, evaluate_sources, save_reference
@@ -177,6 +178,44 @@ def test_damaged_and_altered_files_are_refused_in_one_line(path, tmp_path, capsy
         ]
         assert main(words) == 2
         assert line in the_one_line(capsys.readouterr().err, "evaluate")
+
+
+def with_array_of_another_shape(path, out, metric, change):
+    """Write a file whose hashes hold, in which the first array of a metric is another."""
+
+    def changed(arrays):
+        about = json.loads(arrays["about"].tobytes())
+        kept = next(each for each in about["metrics"] if each["metric"] == metric)
+        for part in kept["real"]:
+            (name, sha256), *_ = part["arrays"].items()
+            array = change(arrays[sha256])
+            part["arrays"][name] = module._sha256_of_array(array)
+            arrays[part["arrays"][name]] = array
+        del about["sha256"]
+        about["sha256"] = sha256_of_json(about)
+        arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+    return rewritten(path, out, changed)
+
+
+@pytest.mark.parametrize("change", [lambda array: array[None], lambda array: np.array(1.0)], ids=["axis", "scalar"])
+def test_arrays_of_another_shape_leave_their_metric_out(path, tmp_path, change):
+    metric = "sliced_wasserstein"
+    altered = with_array_of_another_shape(path, tmp_path / "shape.lgref", metric, change)
+    card, _ = evaluate_sources(SAMPLES, str(altered), dataclasses.replace(SETTINGS, metrics=(metric, "bev_jsd")))
+    assert [score.result.metric for score in card.scores] == ["bev_jsd"]
+    assert [each.metric for each in card.left_out] == [metric]
+
+
+def test_rows_that_always_return_are_two_numbers(path, tmp_path):
+    def four(arrays):
+        about = json.loads(arrays["about"].tobytes()) | {"full_rows": [1, 2, 3, 4]}
+        del about["sha256"]
+        about["sha256"] = sha256_of_json(about)
+        arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+
+    with pytest.raises(DataError, match="full_rows of 4 numbers"):
+        ReferenceFile(rewritten(path, tmp_path / "rows.lgref", four))
 
 
 def test_the_commands(tmp_path, capsys, monkeypatch):

@@ -42,12 +42,14 @@ class Provenance:
         recordings: names of the drives that the images were cut from; empty for generated scans.
         fingerprints: one hash of the pixels for each image; empty where it is not known.
         range_fingerprints: one hash of the ranges for each image, without reflectance; empty where it is not known.
+        label_fingerprints: one hash of the classes for each image, "" without any; empty where it is not known.
     """
 
     names: tuple[str, ...] = ()
     recordings: tuple[str, ...] = ()
     fingerprints: tuple[str, ...] = ()
     range_fingerprints: tuple[str, ...] = ()
+    label_fingerprints: tuple[str, ...] = ()
 
     @property
     def streets(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError
+from lidargrit.core.files import sha256_of_json
 from lidargrit.data.images import Provenance, RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import Source, overlap
@@ -62,7 +63,8 @@ class EvalSet:
 
     def record(self) -> EvalSetRecord:
         """Return the entry of the set in a score file; its hash is of the pixels before limits are applied."""
-        sensor = self.images.sensor
+        sensor, labels = self.images.sensor, self.images.provenance.label_fingerprints
+        compared = [labels[index] for index in self.indices] if len(labels) == len(self.images) else []
         return EvalSetRecord(
             self.source,
             self.data_set,
@@ -74,6 +76,7 @@ class EvalSet:
             self._sha256,
             self.weights_sha256,
             self.streets or self.images.provenance.streets,
+            labels_sha256=sha256_of_json(compared) if any(compared) else "",
         )
 
     @cached_property

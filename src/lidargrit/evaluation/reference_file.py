@@ -105,6 +105,8 @@ class ReferenceFile:
         try:
             self.sensor = SensorModel.from_json(about.pop("sensor"))
             self.contents: Contents = rebuilt(Contents, about)
+            if len(self.contents.full_rows) not in (0, 2):
+                raise TypeError(f"full_rows of {len(self.contents.full_rows)} numbers")
         except (KeyError, TypeError, ConfigError) as error:
             reason = error.got if isinstance(error, ConfigError) else error
             raise DataError(f"{path}, which cannot be used ({reason})", _WANTED, _CURE) from None
@@ -213,8 +215,9 @@ class ReferenceFile:
             raise DataError(f"{self.path}, in which {wrong[0]} of {metric.name} was altered", _WANTED, _CURE)
         try:
             metric.restore(arrays, self.sensor, part.num_scans, weights_sha256, real=real)
-        except KeyError as error:
-            raise DataError(f"{self.path}, which lacks {error} of {metric.name}", _WANTED, _CURE) from None
+        except (KeyError, TypeError, ValueError) as error:
+            got = f"{self.path}, in which an array of {metric.name} is missing or of another shape ({error})"
+            raise DataError(got, _WANTED, _CURE) from None
         return Part(metric)
 
     @contextmanager

@@ -41,6 +41,7 @@ class EvalSetRecord:
         weights_sha256: hash of the weights that generated the scans; "" for scans of other origins.
         streets: versions of the simulated streets that the scans are of, or that their model learned from.
         file_sha256: hash of the reference file that stood in for the scans; "" where these were here.
+        labels_sha256: hash of the classes of the pixels, where ``sha256`` is without these; "" elsewhere.
     """
 
     source: str
@@ -54,6 +55,7 @@ class EvalSetRecord:
     weights_sha256: str = field(default="", compare=False)  # equal pixels are equal
     streets: tuple[str, ...] = field(default=(), compare=False)
     file_sha256: str = field(default="", compare=False)
+    labels_sha256: str = ""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import torch
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
-from lidargrit.core.errors import ClusterError, DataError, LidarGritError, ScanError
+from lidargrit.core.errors import ClusterError, DataError, LidarGritError, ScanError, first_words
 from lidargrit.core.shares import each_done
 from lidargrit.evaluation.intervals import Part, Resampling, Score, blocks, interval_of, merged, real_against_real
 from lidargrit.evaluation.metrics import Metric, WholeImages, load_metric, update_together
@@ -132,11 +132,17 @@ def score_metrics(
         feeding_s = (time.perf_counter() - begun_s) / len(some)
         sizes = [len(group) for group in _groups(pair.samples, resampling)]
         found: list[Score | LidarGritError] = []
-        for each, parts in zip(of_real, generated, strict=True):
+        for factory, each, parts in zip(some, of_real, generated, strict=True):
             try:
                 found.append(each.score(parts, sizes, resampling, time.perf_counter() - feeding_s))
             except LidarGritError as error:
                 found.append(error)
+            except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
+                if not kept:
+                    raise
+                # A file may hold arrays of any shape and type, which metrics meet with errors of many kinds.
+                got = f"a reference file with arrays that do not fit {factory.choice.metric} ({first_words(error)})"
+                found.append(DataError(got, "the file as it was written", "get it again"))
         return found
 
     errors = {index: each for index, each in enumerate(kept) if isinstance(each, LidarGritError)}

@@ -4,6 +4,7 @@ import copy
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -206,6 +207,7 @@ class PreparedImages:
             tuple(scans[image.scan][1] for image in self._images),
             tuple(image.fingerprint for image in self._images),
             tuple(image.range_fingerprint for image in self._images),
+            tuple(image.label_fingerprint if "label" in self._planes else "" for image in self._images),
         )
         self.motions = tuple(_motion_of(scans[image.scan], f"{location}/{SCANS_FILE}") for image in self._images)
 
@@ -239,15 +241,11 @@ class PreparedImages:
 
     def evenly_spaced(self, count: int) -> "PreparedImages":
         """Return so many of the images, evenly spaced, without opening the folder again."""
-        chosen, whole, indices = copy.copy(self), self.provenance, evenly_spaced(count, len(self))
+        chosen, indices = copy.copy(self), evenly_spaced(count, len(self))
         chosen._images = [self._images[index] for index in indices]
         chosen.motions = tuple(self.motions[index] for index in indices)
-        chosen.provenance = Provenance(
-            *(
-                tuple(of[index] for index in indices)
-                for of in (whole.names, whole.recordings, whole.fingerprints, whole.range_fingerprints)
-            )
-        )
+        whole = (getattr(self.provenance, of.name) for of in fields(Provenance))
+        chosen.provenance = Provenance(*(tuple(of[index] for index in indices) for of in whole))
         return chosen
 
     def on_rays_of(self, sensor: SensorModel, variant: str) -> ImageStore:

@@ -91,9 +91,9 @@ class ArchiveWriter:
 
         A command that stopped at a bad point or scan may go on without it.
         """
-        if begun["header"] != self._header:
+        before = begun.get("chosen")
+        if begun.get("header") != self._header or not isinstance(before, dict):
             raise self._of_others("scans of another model, step or version")
-        before = begun["chosen"]
         changed = [name for name, of in chosen.items() if before.get(name) not in (of, *_STRICTER.get(name, ()))]
         if changed:
             raise self._of_others(f"scans of other options ({', '.join(changed)})")
@@ -106,7 +106,9 @@ class ArchiveWriter:
         """
         there = self._numbers()
         for number in there:
-            _, identity, _ = _facts(self.folder / str(number))
+            path = self.folder / str(number)
+            with path.open("rb") as file:
+                _, identity, _ = _facts(file.readline(), path)
             if identity not in identities[number : number + 1]:
                 raise self._of_others(f"the scan {number}, {identity}, which is none of these")
         return sorted({*range(len(identities))} - {*there})
@@ -137,8 +139,9 @@ class ArchiveWriter:
 
     def _written(self) -> Iterator[tuple[str, int, bytes]]:
         for number in self._numbers():
-            facts, _, compressed = (self.folder / str(number)).read_bytes().partition(b"\n")
-            name, _, returns = json.loads(facts)
+            path = self.folder / str(number)
+            facts, _, compressed = path.read_bytes().partition(b"\n")
+            name, _, returns = _facts(facts, path)
             yield name, returns, compressed
 
     def _of_others(self, held: str) -> OutputError:
@@ -156,9 +159,12 @@ def add_scan(folder: Path, number: int, facts: tuple[str, str, int], compressed:
         unfinished.write_bytes(json.dumps(facts).encode() + b"\n" + compressed)
 
 
-def _facts(path: Path) -> tuple[str, str, int]:
-    with path.open("rb") as file:
-        name, identity, returns = json.loads(file.readline())
+def _facts(line: bytes, path: Path) -> tuple[str, str, int]:
+    wanted, cure = "a scan that lidargrit compress wrote", "remove it, and give the same command again"
+    facts = parse_json(line, str(path), list, OutputError, wanted, cure)
+    if [type(each) for each in facts] != [str, str, int]:
+        raise OutputError(f"{path}, which does not begin with a name, an identity and a number", wanted, cure)
+    name, identity, returns = facts
     return name, identity, returns
 
 

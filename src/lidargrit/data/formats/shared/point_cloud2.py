@@ -41,9 +41,9 @@ def _points(cloud: Any, size: int) -> np.ndarray:
     width, height, row = int(cloud.width), int(cloud.height), int(cloud.row_step)
     if width * height > POINTS_AT_MOST or width * height * size > len(data):
         raise ValueError(f"{width}x{height} points of {size} bytes in {len(data)} bytes")
-    if height > 1 and width * size < row and row * height <= len(data):
-        data = np.ascontiguousarray(data[: row * height].reshape(height, row)[:, : width * size]).reshape(-1)
-    return data[: width * height * size].reshape(width * height, size)
+    last = row * (height - 1)  # beginning of a row that often ends without the gap that the others have
+    step = row if row > width * size and last + width * size <= len(data) else width * size
+    return np.ndarray((height, width, size), np.uint8, data, strides=(step, size, 1)).reshape(-1, size)
 
 
 def _column(points: np.ndarray, kind: str, offset: int) -> np.ndarray:
