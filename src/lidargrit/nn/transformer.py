@@ -25,11 +25,7 @@ _KEYS_AT_MOST = 1024  # beyond, scores no longer fit the cache, and the memory f
 
 
 def attend(
-    query: Float[Tensor, "B H T D"],
-    key: Float[Tensor, "B H T D"],
-    value: Float[Tensor, "B H T D"],
-    *,
-    causal: bool,
+    query: Float[Tensor, "B H T D"], key: Float[Tensor, "B H T D"], value: Float[Tensor, "B H T D"], *, causal: bool
 ) -> Float[Tensor, "B H T D"]:
     """Return softmax(query key' / sqrt(D)) value, of one sequence with itself.
 

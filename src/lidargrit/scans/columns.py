@@ -161,13 +161,7 @@ def known_name(name: str) -> str:
 def quantity_of(name: str) -> str:
     """Return what of a scan a column holds: x, y, z, reflectance, ring, label, filled or time; "" for nothing."""
     plain = _plain(name)
-    kinds = {
-        "reflectance": REFLECTANCE_NAMES,
-        "ring": _RING,
-        "label": _LABEL,
-        "filled": _FILLED,
-        "time": TIME_NAMES,
-    }
+    kinds = {"reflectance": REFLECTANCE_NAMES, "ring": _RING, "label": _LABEL, "filled": _FILLED, "time": TIME_NAMES}
     return plain if plain in ("x", "y", "z") else next((kind for kind, names in kinds.items() if plain in names), "")
 
 

@@ -187,10 +187,7 @@ def observe_scene(
 
 
 def _beside(
-    tracer: Tracer,
-    beams: Beams,
-    poses: tuple[Float64[np.ndarray, "4 4"], ...],
-    stride: int,
+    tracer: Tracer, beams: Beams, poses: tuple[Float64[np.ndarray, "4 4"], ...], stride: int
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """Cast the fine columns to the left and to the right of every ``stride``-th."""
     found = []

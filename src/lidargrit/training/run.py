@@ -40,12 +40,7 @@ PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 """Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
 
 
-def train(
-    preset: Preset,
-    folder: Path,
-    plot: PlotProgress | None = None,
-    wandb_project: str = "",
-) -> Generator:
+def train(preset: Preset, folder: Path, plot: PlotProgress | None = None, wandb_project: str = "") -> Generator:
     """Train every stage of a preset in a run folder and return the finished generator.
 
     The same call resumes a stopped training. Before the first step, the folder holds ``run.json`` (preset, command,
@@ -81,12 +76,7 @@ def train(
 
 
 def _train(
-    preset: Preset,
-    checked: CheckedStages,
-    opened: OpenedData,
-    folder: Path,
-    plot: PlotProgress | None,
-    engine: Engine,
+    preset: Preset, checked: CheckedStages, opened: OpenedData, folder: Path, plot: PlotProgress | None, engine: Engine
 ) -> Generator:
     train_images = joined_images(opened.train, preset.data)
     val_images = joined_images(opened.val, preset.data)

@@ -11,13 +11,7 @@ from torch import Tensor, nn
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.phase_network import Guide, PhaseNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise, following
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    at_phases,
-    cells_of,
-    one_of_phases,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, cells_of, one_of_phases
 from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel

@@ -12,13 +12,7 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Share
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    cells_of,
-    generated_before,
-    phases_of,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, cells_of, generated_before, phases_of
 from lidargrit.generation.pixel_decoder.ray_encoding import LEAST_CELL, RowEncoding, coarsest_cell_of
 from lidargrit.nn.blocks import Network
 from lidargrit.nn.convolution import Convolution, Residual

@@ -16,13 +16,7 @@ from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
 from lidargrit.generation.pixel_decoder.phase_network import Guide, PixelDecoderConfig
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    at_phases,
-    join_phases,
-    one_of_phases,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
 from lidargrit.generation.range_steps import RangeSteps
 from lidargrit.nn.collectives import mean_over_processes

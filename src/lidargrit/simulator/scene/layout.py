@@ -268,11 +268,7 @@ def _met(plan: StreetPlan, u_m: np.ndarray, turn_rad: float | np.ndarray, speed_
 
 
 def traffic(
-    rng: np.random.Generator,
-    plan: StreetPlan,
-    town: Settlement,
-    oncoming_m_s: float = 0.0,
-    first_instance: int = 1,
+    rng: np.random.Generator, plan: StreetPlan, town: Settlement, oncoming_m_s: float = 0.0, first_instance: int = 1
 ) -> list[ObjectBatch]:
     """Sample all vehicles, people and bicycles, each with an instance of its own.
 

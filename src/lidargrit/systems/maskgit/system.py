@@ -15,12 +15,7 @@ from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.tokens import (
-    DecodingOfTokens,
-    TokenGenerator,
-    TokenGeneratorConfig,
-    TokenObjective,
-)
+from lidargrit.generation.tokens import DecodingOfTokens, TokenGenerator, TokenGeneratorConfig, TokenObjective
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.random import gumbel_of, rngs_of, sample_index
 from lidargrit.nn.transformer import MaskedTransformer

@@ -82,11 +82,7 @@ class EfficientUnet(Network):
     coords: Tensor
 
     def __init__(
-        self,
-        config: UnetConfig,
-        images: int,
-        elevation_rad: Float[Tensor, "H W"],
-        azimuth_rad: Float[Tensor, "H W"],
+        self, config: UnetConfig, images: int, elevation_rad: Float[Tensor, "H W"], azimuth_rad: Float[Tensor, "H W"]
     ) -> None:
         super().__init__()
         height, width = elevation_rad.shape

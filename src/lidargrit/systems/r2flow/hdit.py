@@ -112,11 +112,7 @@ class Hdit(Network):
     coords: Tensor
 
     def __init__(
-        self,
-        config: HditConfig,
-        images: int,
-        elevation_rad: Float[Tensor, "H W"],
-        azimuth_rad: Float[Tensor, "H W"],
+        self, config: HditConfig, images: int, elevation_rad: Float[Tensor, "H W"], azimuth_rad: Float[Tensor, "H W"]
     ) -> None:
         super().__init__()
         height, width = elevation_rad.shape
