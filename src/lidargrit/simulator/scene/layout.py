@@ -293,14 +293,11 @@ def traffic(
     kinds[placements.across] = HATCHBACK  # short drives and narrow streets
     groups = [make_vehicles(rng, kinds, placements, first_instance)]
     following = first_instance + len(placements)
-    walkers = _walkers(rng, plan)
-    if len(walkers):
-        groups.append(make_walkers(rng, walkers, following))
-    following += len(walkers)
-    riders = _riders(rng, plan)
-    if len(riders):
-        groups.append(make_cyclists(rng, riders, following))
-    following += len(riders)
+    for sample, make in ((_walkers, make_walkers), (_riders, make_cyclists)):
+        people = sample(rng, plan)
+        if len(people):
+            groups.append(make(rng, people, following))
+        following += len(people)
     count = rng.poisson(1.2 * plan.stretch.share(40.0)) if plan.theme != "country" else 0
     side = rng.choice([-1, 1], count)
     v = np.where(side > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
