@@ -19,7 +19,7 @@ from lidargrit.generation.pixel_decoder.phase_network import Guide, PixelDecoder
 from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.nn.collectives import mean_over_processes
+from lidargrit.nn.collectives import num_processes, sum_over_processes
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.random import of_host
 from lidargrit.scans.condition import Observed
@@ -195,8 +195,8 @@ class PixelDecoder(RayNetwork):
             mask_nats = mask_nats + share * of_mask.sum()
             range_nats = range_nats + share * of_range.sum()
             returns = returns + share * at_phases(images.return_mask, chosen).sum()
-        if self.training:  # as many returns as one process with the whole batch would divide by, for each process
-            returns = mean_over_processes(returns)
+        if self.training:  # the mean over processes of part / mean is the sum of the parts over that of the returns
+            returns = sum_over_processes(returns) / num_processes()
         return mask_nats / pixels, range_nats / returns.clamp(min=1)
 
     @property
