@@ -125,7 +125,10 @@ def treated_parts(parts: ScanParts, bad_points: BadPoints) -> ScanParts:
         raise UnknownNameError(f"bad_points={bad_points!r}", one_of(get_args(BadPoints)), "choose one")
     if bad_points == "refuse":
         return parts
-    kept = usable_points(parts["points_xyz_m"], parts.get("reflectance"))
+    points_xyz_m, reflectance = parts["points_xyz_m"], parts.get("reflectance")
+    kept = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    if reflectance is not None:
+        kept &= ~reflectance.isnan()
     if bool(kept.all()):
         return parts
     told = f"{int((~kept).sum()):,} of {len(kept):,} points left out: NaN, infinite or at the origin"
@@ -145,12 +148,6 @@ def selected(parts: ScanParts, which: Tensor) -> ScanParts:
     if rows is not None:
         chosen["rows"] = FileRows(rows.columns, rows.of_point[which.numpy()])
     return chosen
-
-
-def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
-    """Return which points are returns: finite, away from the origin, and with a reflectance if any has one."""
-    usable = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
-    return usable if reflectance is None else usable & ~reflectance.isnan()
 
 
 def known_name(name: str) -> str:

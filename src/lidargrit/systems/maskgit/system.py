@@ -163,14 +163,11 @@ def generate_tokens(
         uniform = torch.stack([torch.rand(2, length, generator=rng) for rng in rngs], dim=1).to(device)
         with autocast_to(sampling.weights, device):
             logits = transformer(tokens).float()
-        sampled = _sample(logits, uniform[0], sampling.temperature)
+        cold = sampling.temperature == 0
+        sampled = logits.argmax(dim=-1) if cold else sample_index(logits / sampling.temperature, uniform[0])
         confidence = logits.log_softmax(dim=-1).gather(-1, sampled[..., None])[..., 0]
         confidence += sampling.order_temperature * (1 - done / len(schedule)) * gumbel_of(uniform[1])
         hidden = tokens == transformer.mask_token
         kept = confidence.masked_fill(~hidden, torch.inf).topk(length - left, dim=1).indices
         tokens = tokens.scatter(1, kept, torch.where(hidden, sampled, tokens).gather(1, kept))
     return tokens
-
-
-def _sample(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
-    return logits.argmax(dim=-1) if temperature == 0 else sample_index(logits / temperature, uniform)
