@@ -27,9 +27,8 @@ from lidargrit.scans.planes import planes_of
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage
 
-_Guided = tuple[
-    dict[Lattice, Tensor], dict[Lattice, Tensor]
-]  # by lattice: the guide's part of the first layers, of both
+# By lattice: the guide's part of the first layers, of both networks.
+_Guided = tuple[dict[Lattice, Tensor], dict[Lattice, Tensor]]
 
 _ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so many pixels, or fewer
 

@@ -203,9 +203,8 @@ def _stall(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 
 def _box(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A skip, a container for glass, a toilet hut or a pile of crates: a body that widens upwards, with a rim."""
-    length, wide, tall = rng.choice(
-        [(1.8, 0.9, 1.3), (0.75, 0.75, 1.7), (0.55, 0.55, 2.2), (0.6, 0.4, 1.2)]
-    ) * rng.uniform(0.9, 1.1, 3)
+    sizes = [(1.8, 0.9, 1.3), (0.75, 0.75, 1.7), (0.55, 0.55, 2.2), (0.6, 0.4, 1.2)]
+    length, wide, tall = rng.choice(sizes) * rng.uniform(0.9, 1.1, 3)
     corner = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     slope = rng.uniform(0.8, 1.0)
     outline = ((slope, 0.0), (1.0, tall - 0.12), (1.05, tall - 0.12), (1.05, tall))

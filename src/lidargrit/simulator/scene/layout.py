@@ -332,9 +332,8 @@ def _riders(rng: np.random.Generator, plan: StreetPlan) -> Placements:
 def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:
     count = rng.poisson(_WALKERS[plan.theme] * plan.stretch.share_around(28.0))
     side = rng.choice([-1, 1], count)
-    across = np.where(side > 0, *plan.edge_m[::-1]) + np.where(side > 0, *plan.pavement_m[::-1]) * rng.uniform(
-        0.3, 0.9, count
-    )
+    edge_m, pavement_m = np.where(side > 0, *plan.edge_m[::-1]), np.where(side > 0, *plan.pavement_m[::-1])
+    across = edge_m + pavement_m * rng.uniform(0.3, 0.9, count)
     speed = np.where(rng.random(count) < 0.75, rng.uniform(0.7, 1.8, count), 0.0)
     u = plan.stretch.around(rng, 28.0, count)
     if plan.stretch is Stretch.FIRST:

@@ -133,7 +133,7 @@ def _cabin(builder: ShapeBuilder, body: _Body) -> None:
             builder.add_box(_DARK, (back - 0.12, y - 0.24, belt - 0.5), (back, y + 0.24, belt + 0.16))
             builder.add_box(_DARK, (back - 0.11, y - 0.13, belt + 0.18), (back - 0.02, y + 0.13, belt + 0.38))
     start, stop = max(kind.windows[0][0] - 0.06, 0.03), max(span[1] for span in (*kind.windows, kind.rear_screen))
-    builder.add_box(_DARK, (body.x_m(stop), -half, 0.42), (body.x_m(start), half, belt - 0.3))
+    builder.add_box(_DARK, (float(body.x_m(stop)), -half, 0.42), (float(body.x_m(start)), half, belt - 0.3))
     mirror = kind.windows[0][0] + 0.02
     for side in (-1, 1):
         corner = np.array([body.x_m(mirror) - 0.07, side * (body.width_m / 2 + 0.09) - 0.09, belt + 0.0])
@@ -156,7 +156,7 @@ def _cargo(builder: ShapeBuilder, body: _Body) -> None:
     builder.add_box(_DARK, (tail, -0.45, 0.6), (nose, 0.45, 1.05))
     for side in (-1, 1):  # the guard between the axles, and the lamps' beam behind
         y = side * (half - 0.08)
-        builder.add_box(_METAL, (body.x_m(0.62), y - 0.03, 0.45), (body.x_m(0.34), y + 0.03, 0.85))
+        builder.add_box(_METAL, (float(body.x_m(0.62)), y - 0.03, 0.45), (float(body.x_m(0.34)), y + 0.03, 0.85))
 
 
 @cache

@@ -117,9 +117,8 @@ class HiddenTokens(TokenObjective):
         tokens, unigram_nll = self.encode(example)
         count, length = tokens.shape
         # Each scan's progress is uniform in [0, 1); within a batch they are evenly spread, which calms the loss.
-        progress = (
-            torch.rand(1, generator=rng, device=rng.device) + torch.arange(count, device=rng.device) / count
-        ) % 1
+        apart = torch.arange(count, device=rng.device) / count
+        progress = (torch.rand(1, generator=rng, device=rng.device) + apart) % 1
         hidden_each = (share_hidden(progress) * length).ceil().clamp(min=1)
         rank = torch.rand(tokens.shape, generator=rng, device=rng.device).argsort(dim=1).argsort(dim=1)
         hidden = (rank < hidden_each[:, None]).to(tokens.device)
