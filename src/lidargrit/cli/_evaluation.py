@@ -30,9 +30,8 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     if public_name(options.protocol) in (*MEASURED, DRIVE):
         return *_of_drives(options), None
     names = ("protocol", "device", *_OF_CARDS)
-    config = read_config(
-        scan_settings(options, max_scans=options.count), **{name: vars(options)[name] for name in names}
-    )
+    settings = scan_settings(options, max_scans=options.count)
+    config = read_config(settings, **{name: vars(options)[name] for name in names})
     sets = (options.samples, options.reference)
     if options.save_reference:
         refuse_unused(options, "with --save-reference", ("save_reference", *_OF_REFERENCE, *_OF_CARDS))
@@ -60,9 +59,8 @@ def _of_drives(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     from lidargrit.evaluation.evaluate import read_config
     from lidargrit.evaluation.protocols import public_name
 
-    config = read_config(
-        scan_settings(options, max_scans=options.count), protocol=options.protocol, device=options.device
-    )
+    settings = scan_settings(options, max_scans=options.count)
+    config = read_config(settings, protocol=options.protocol, device=options.device)
     if not options.samples:
         raise UsageError(
             "no drives", "their folder or source", "name it, as in lidargrit evaluate DRIVES --protocol drive"

@@ -33,12 +33,6 @@ def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json")
     parser.add_argument("--overwrite", action="store_true", help=f"replace {files}")
 
 
-def add_table(parser: argparse.ArgumentParser) -> None:
-    """Add ``--table``, the form of a printed table."""
-    forms = {"choices": ["text", "markdown", "latex"], "default": "text", "metavar": "FORM"}
-    parser.add_argument("--table", help="text, markdown or latex", **forms)
-
-
 def refuse_taken(options: argparse.Namespace, *others: Path) -> None:
     """Refuse, before any work, to replace a file that ``--json`` names, or ``others`` of the verb, with OutputError."""
     if options.json in (None, STANDARD_OUTPUT):

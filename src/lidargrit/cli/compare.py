@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lidargrit.cli._comparison import COMPLETED, DEFAULTS, compared
 from lidargrit.cli._options import add_device, add_scans
-from lidargrit.cli._results import add_json, add_table, print_result, refuse_taken
+from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.core.untrusted import WholeNumber, process_count, seed_number, whole_number
 
 EXAMPLES = """\
@@ -42,7 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=seed_number, default=0, metavar="N", help="seed of completions and of random pixels")
     add_scans(parser, "settings of all presets, or of reading scans")
     add_device(parser)
-    add_table(parser)
+    forms = ["text", "markdown", "latex"]
+    add("--table", choices=forms, default="text", metavar="FORM", help="text, markdown or latex")
     add_json(parser)
 
 

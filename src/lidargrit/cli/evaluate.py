@@ -39,12 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scans(parser)
     add("--model", default="", metavar="RUN", help="model of raydrop (streets) or of drives (forecast)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
-    add(
-        "--save-reference",
-        type=Path,
-        metavar="FILE",
-        help="only keep of SAMPLES, real scans, what others score by (.lgref)",
-    )
+    kept = "only keep of SAMPLES, real scans, what others score by (.lgref)"
+    add("--save-reference", type=Path, metavar="FILE", help=kept)
     add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
     add_json(parser, "the files of --json, --report and --save-reference")
 

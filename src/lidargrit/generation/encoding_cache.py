@@ -50,10 +50,7 @@ class EncodingCache(Frozen[NetworkT]):
     """
 
     def __init__(
-        self,
-        network: NetworkT,
-        encode: Callable[[NetworkT, RangeImage], Tensor],
-        bytes_at_most: int = _BYTES_AT_MOST,
+        self, network: NetworkT, encode: Callable[[NetworkT, RangeImage], Tensor], bytes_at_most: int = _BYTES_AT_MOST
     ) -> None:
         super().__init__(network)
         self._encode = encode

@@ -71,11 +71,7 @@ def upload(
         if branch is not None:
             api.create_branch(repo_id, branch=branch, exist_ok=True)
         commit = api.upload_folder(
-            repo_id=repo_id,
-            folder_path=folder,
-            commit_message=commit_message,
-            revision=branch,
-            create_pr=create_pr,
+            repo_id=repo_id, folder_path=folder, commit_message=commit_message, revision=branch, create_pr=create_pr
         )
     except Exception as error:  # as above
         got, cure = f"{repo_id}, to which nothing was uploaded ({_told(error)})", "log in with: hf auth login"

@@ -148,13 +148,7 @@ PIXEL_DECODER = PixelDecoderConfig(
 
 
 def preset(
-    title: str,
-    data: DataConfig,
-    model: Any,
-    *,
-    seed: int = 0,
-    published: str = "",
-    **training: TrainingConfig,
+    title: str, data: DataConfig, model: Any, *, seed: int = 0, published: str = "", **training: TrainingConfig
 ) -> Preset:
     """Return a preset of the system whose configuration the model is.
 

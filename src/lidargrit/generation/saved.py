@@ -17,7 +17,7 @@ from lidargrit.generation.hub import upload
 from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds
 from lidargrit.nn.exact_weights import load_exactly
 from lidargrit.nn.quantization import WeightBits, with_quantized, without_quantized
-from lidargrit.nn.size import numbers_at_most, numbers_of_files
+from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
 
@@ -146,7 +146,8 @@ class SavedModel(nn.Module, Generic[ConfigT]):
             CheckpointError: other files, or weights of other sizes.
         """
         config, networks = cls.read_published(files, config, sensor)
-        with numbers_of_files(files):
+        numbers = sum(path.stat().st_size for path in files) // 2 + 2**20
+        with numbers_at_most(numbers, f"{files[0]} with a network", "check which program saved it"):
             generator = cls(config, sensor)
         for number, (name, weights) in enumerate(networks.items()):
             network = generator.get_submodule(name)

@@ -1,4 +1,4 @@
-"""Sums, means and samples over the processes of a training, equal to those of one process with the whole batch."""
+"""Sums and samples over the processes of a training, equal to those of one process with the whole batch."""
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -10,14 +10,6 @@ def sum_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*sh
     if _several():
         distributed.all_reduce(counted)
     return counted
-
-
-def mean_over_processes(counted: Shaped[Tensor, "*shape"]) -> Shaped[Tensor, "*shape"]:
-    """Return the mean of a tensor over all processes; the tensor itself becomes their sum.
-
-    The mean over processes of ``part / mean`` is the sum of all parts over the sum of what is counted.
-    """
-    return sum_over_processes(counted) / num_processes()
 
 
 def num_processes() -> int:

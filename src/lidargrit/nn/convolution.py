@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
-from lidargrit.nn.blocks import Block
+from lidargrit.nn.blocks import Block, zeroed
 
 Padding = Literal["zero", "wrap"]
 
@@ -179,10 +179,7 @@ class Residual(Block):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.conv1, self.conv2 = Convolution(width, width, "wrap"), Convolution(width, width, "wrap")
-        nn.init.zeros_(self.conv2.weight)
-        assert self.conv2.bias is not None
-        nn.init.zeros_(self.conv2.bias)
+        self.conv1, self.conv2 = Convolution(width, width, "wrap"), zeroed(Convolution(width, width, "wrap"))
 
     def forward(self, x: Float[Tensor, "B C h w"]) -> Float[Tensor, "B C h w"]:
         """Add what the two convolutions find to the input."""

@@ -12,9 +12,7 @@ _RISE, _FALL = 0.05, 0.25  # shares of steps in which the rate rises from 0, and
 
 
 def search_latents(
-    error_of: Callable[[Tensor], Tensor],
-    noise: Float[Tensor, "B steps_and_start D"],
-    rate: float,
+    error_of: Callable[[Tensor], Tensor], noise: Float[Tensor, "B steps_and_start D"], rate: float
 ) -> Float[Tensor, "B D"]:
     """Search the latent of the least error for each row of a batch, independently.
 

@@ -1,9 +1,8 @@
 """Bounds on what is built and computed at once: settings → a network, a batch → what it gives, or an error."""
 
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
@@ -17,12 +16,6 @@ from lidargrit.core.errors import ConfigError
 
 NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our presets
 _MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our presets have 2,000
-
-
-def numbers_of_files(paths: Sequence[Path]) -> AbstractContextManager[None]:
-    """Refuse to build networks larger than the checkpoints of which their sizes were read; see numbers_at_most."""
-    size = sum(path.stat().st_size for path in paths)
-    return numbers_at_most(size // 2 + 2**20, f"{paths[0]} with a network", "check which program saved it")
 
 
 @contextmanager
@@ -39,28 +32,25 @@ def numbers_at_most(
     Args:
         count: largest number of weights and buffer elements of all modules that are built in the block.
     """
-    found, own = 0, threading.get_ident()  # the hooks see the networks of all threads
+    found, own = {"numbers": 0, "modules": 0}, threading.get_ident()  # the hooks see the networks of all threads
 
-    def add(module: nn.Module, name: str, tensor: Tensor | None) -> None:
-        nonlocal found
-        if threading.get_ident() != own:
-            return
-        found += 0 if tensor is None else tensor.numel()
-        if found > count:
-            raise ConfigError(f"{what} of more than {count:,} numbers", "fewer", cure)
+    def add(unit: str, number: int, at_most: int) -> None:
+        if threading.get_ident() == own:
+            found[unit] += number
+            if found[unit] > at_most:
+                raise ConfigError(f"{what} of more than {at_most:,} {unit}", "fewer", cure)
 
-    modules = 0
+    def add_tensor(module: nn.Module, name: str, tensor: Tensor | None) -> None:
+        add("numbers", 0 if tensor is None else tensor.numel(), count)
 
     def add_module(module: nn.Module, name: str, part: nn.Module | None) -> None:
-        nonlocal modules
-        if threading.get_ident() != own:
-            return
-        modules += 1
-        if modules > _MODULES_AT_MOST:
-            raise ConfigError(f"{what} of more than {_MODULES_AT_MOST:,} modules", "fewer", cure)
+        add("modules", 1, _MODULES_AT_MOST)
 
-    hooks = [register_module_parameter_registration_hook(add), register_module_buffer_registration_hook(add)]
-    hooks.append(register_module_module_registration_hook(add_module))
+    hooks = [
+        register_module_parameter_registration_hook(add_tensor),
+        register_module_buffer_registration_hook(add_tensor),
+        register_module_module_registration_hook(add_module),
+    ]
     try:
         yield
     except (RuntimeError, MemoryError, OverflowError, TypeError) as error:  # a single tensor that no machine can hold

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Count, NotNegative
-from lidargrit.nn.blocks import Network
+from lidargrit.nn.blocks import Network, zeroed
 from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.transformer import TransformerBlock, TransformerConfig
 
@@ -96,14 +96,9 @@ class SmallUnet(Network):
         nn.init.normal_(self.out.weight, std=0.02)
         assert self.out.bias is not None
         nn.init.zeros_(self.out.bias)
-        self.more_in = nn.ModuleDict(
-            {name: nn.Conv2d(4 * part.inputs, first, 1, bias=False) for name, part in parts.items() if part.inputs}
-        )
-        self.more_out = nn.ModuleDict(
-            {name: nn.Conv2d(first, 4 * part.outputs, 1) for name, part in parts.items() if part.outputs}
-        )
-        for weights in (*self.more_in.parameters(), *self.more_out.parameters()):
-            nn.init.zeros_(weights)
+        into = {name: nn.Conv2d(4 * part.inputs, first, 1, bias=False) for name, part in parts.items() if part.inputs}
+        out_of = {name: nn.Conv2d(first, 4 * part.outputs, 1) for name, part in parts.items() if part.outputs}
+        self.more_in, self.more_out = zeroed(nn.ModuleDict(into)), zeroed(nn.ModuleDict(out_of))
 
     def forward(
         self, maps: Float[Tensor, "B C H W"], more: Mapping[str, Float[Tensor, "B _ H W"]]

@@ -25,11 +25,7 @@ _KEYS_AT_MOST = 1024  # beyond, scores no longer fit the cache, and the memory f
 
 
 def attend(
-    query: Float[Tensor, "B H T D"],
-    key: Float[Tensor, "B H T D"],
-    value: Float[Tensor, "B H T D"],
-    *,
-    causal: bool,
+    query: Float[Tensor, "B H T D"], key: Float[Tensor, "B H T D"], value: Float[Tensor, "B H T D"], *, causal: bool
 ) -> Float[Tensor, "B H T D"]:
     """Return softmax(query key' / sqrt(D)) value, of one sequence with itself.
 
@@ -337,10 +333,7 @@ class _Attention(nn.Module):
     def __init__(self, config: TransformerConfig, causal: bool) -> None:
         super().__init__()
         self.heads, self.causal = config.heads, causal
-        self.key = nn.Linear(config.width, config.width)
-        self.query = nn.Linear(config.width, config.width)
-        self.value = nn.Linear(config.width, config.width)
-        self.proj = nn.Linear(config.width, config.width)
+        self.key, self.query, self.value, self.proj = (nn.Linear(config.width, config.width) for _ in range(4))
 
     def forward(self, x: Tensor) -> Tensor:
         q, k, v = (

@@ -125,7 +125,10 @@ def treated_parts(parts: ScanParts, bad_points: BadPoints) -> ScanParts:
         raise UnknownNameError(f"bad_points={bad_points!r}", one_of(get_args(BadPoints)), "choose one")
     if bad_points == "refuse":
         return parts
-    kept = usable_points(parts["points_xyz_m"], parts.get("reflectance"))
+    points_xyz_m, reflectance = parts["points_xyz_m"], parts.get("reflectance")
+    kept = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    if reflectance is not None:
+        kept &= ~reflectance.isnan()
     if bool(kept.all()):
         return parts
     told = f"{int((~kept).sum()):,} of {len(kept):,} points left out: NaN, infinite or at the origin"
@@ -147,12 +150,6 @@ def selected(parts: ScanParts, which: Tensor) -> ScanParts:
     return chosen
 
 
-def usable_points(points_xyz_m: Float[Tensor, "n 3"], reflectance: Float[Tensor, "n"] | None) -> Bool[Tensor, "n"]:
-    """Return which points are returns: finite, away from the origin, and with a reflectance if any has one."""
-    usable = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
-    return usable if reflectance is None else usable & ~reflectance.isnan()
-
-
 def known_name(name: str) -> str:
     """Return the plain name of a column besides x, y and z that a scan has room for; "" if it has none."""
     return _plain(name) if _plain(name) in (*REFLECTANCE_NAMES, *_RING, *_LABEL, *_FILLED, *TIME_NAMES) else ""
@@ -161,13 +158,7 @@ def known_name(name: str) -> str:
 def quantity_of(name: str) -> str:
     """Return what of a scan a column holds: x, y, z, reflectance, ring, label, filled or time; "" for nothing."""
     plain = _plain(name)
-    kinds = {
-        "reflectance": REFLECTANCE_NAMES,
-        "ring": _RING,
-        "label": _LABEL,
-        "filled": _FILLED,
-        "time": TIME_NAMES,
-    }
+    kinds = {"reflectance": REFLECTANCE_NAMES, "ring": _RING, "label": _LABEL, "filled": _FILLED, "time": TIME_NAMES}
     return plain if plain in ("x", "y", "z") else next((kind for kind, names in kinds.items() if plain in names), "")
 
 

@@ -70,11 +70,6 @@ class SeenScan:
         return self.range_m[self.nearest_return]
 
 
-def nearest(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
-    """Return for every pixel the range of the nearest observed return, in metres."""
-    return seen.nearest_range_m
-
-
 def along_rows(
     range_m: Float64[np.ndarray, "H W"], azimuth_rad: Float64[np.ndarray, " W"], at_most_rad: float
 ) -> Float64[np.ndarray, "H W"]:
@@ -173,11 +168,6 @@ def triangulate(seen: SeenScan) -> Triangles:
     return found
 
 
-def triangulation(seen: SeenScan) -> Float64[np.ndarray, "H W"]:
-    """Interpolate 1 / range linearly in a Delaunay triangulation of the observed returns, within surfaces."""
-    return seen.triangles.range_m
-
-
 def of_nearest(seen: SeenScan, pixels: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
     """Return for every pixel a quantity of the nearest observed return."""
     return pixels[seen.nearest_return]
@@ -200,9 +190,9 @@ class Fill(NamedTuple):
 
 
 FILLS: dict[str, Fill] = {
-    "nearest": Fill(nearest, of_nearest),
+    "nearest": Fill(lambda seen: seen.nearest_range_m, of_nearest),
     "linear": Fill(linear, of_nearest),
-    "triangulation": Fill(triangulation, of_triangle),
+    "triangulation": Fill(lambda seen: seen.triangles.range_m, of_triangle),
 }
 """Classical methods by the name that a user types."""
 
@@ -317,7 +307,7 @@ def ranges_from_others(images: RangeImage, rng: torch.Generator) -> RangeImage:
             seen = SeenScan.of(Observed.of_pixels(images[index : index + 1], given[None]), 0)
             if not seen.returned.any():
                 raise ScanError("a scan with hardly any return", "returns on every side", "leave the scan out")
-            range_m = torch.where(given.cpu(), range_m, torch.from_numpy(triangulation(seen)))
+            range_m = torch.where(given.cpu(), range_m, torch.from_numpy(seen.triangles.range_m))
         found.append(range_m.float().clamp(sensor.range_min_m, sensor.range_max_m))
     range_m = torch.stack(found).to(device)
     return RangeImage(range_m, torch.ones_like(images.return_mask), sensor)

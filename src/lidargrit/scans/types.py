@@ -12,14 +12,7 @@ from jaxtyping import Bool, Float, Float64, Int, Shaped
 from torch import Tensor
 
 from lidargrit.core.errors import OR_LEAVE_IT_OUT, ConfigError, ScanError
-from lidargrit.scans.columns import (
-    BadPoints,
-    ScanParts,
-    Values,
-    columns_of_arrays,
-    parts_of_columns,
-    selected,
-)
+from lidargrit.scans.columns import BadPoints, ScanParts, Values, columns_of_arrays, parts_of_columns, selected
 from lidargrit.scans.file_rows import FileRows
 from lidargrit.scans.planes import NO_PLANES, checked_planes, common_planes, masked_planes, planes_of
 from lidargrit.scans.sensors import SensorModel

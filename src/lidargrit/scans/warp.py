@@ -237,14 +237,8 @@ def _on_rays(
     new_m, cos_incidence = _corrected(distance_m, moved_m, _turned(matrix, _normals(range_m, rays.fine, pixel)), ray)
     chord = moved_m / distance_m - ray
     column_rad = 2 * math.pi / rays.fine.shape[2]
-    found = _OnRays(
-        target,
-        new_m,
-        age_s.expand_as(new_m),
-        cos_incidence,
-        _dot(chord, chord).sqrt(),
-        sine <= math.sin(column_rad / 2),
-    )
+    offset_rad, is_close = _dot(chord, chord).sqrt(), sine <= math.sin(column_rad / 2)
+    found = _OnRays(target, new_m, age_s.expand_as(new_m), cos_incidence, offset_rad, is_close)
     reached = (sine <= math.sin(column_rad)) & (new_m >= rays.limits_m[0]) & (new_m <= rays.limits_m[1])
     return _OnRays(*(part[reached] for part in found))
 

@@ -23,16 +23,7 @@ from lidargrit.simulator.scene.plan_sampling import sample_street_plan
 from lidargrit.simulator.scene.stretches import EXTENT_M
 from lidargrit.simulator.setups import setup_of
 
-__all__ = [
-    "Observation",
-    "RaydropModel",
-    "Scene",
-    "Theme",
-    "frames_before_end",
-    "observe",
-    "poses_of",
-    "simulate",
-]
+__all__ = ["Observation", "RaydropModel", "Scene", "Theme", "frames_before_end", "observe", "poses_of", "simulate"]
 
 FRAME_S = REVOLUTION_S  # from one frame to the next
 ROAD_M = 100.0  # that our car drives in a street that ends: .97 of the returns are still there, after 140 m .17

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from lidargrit.scans.sensors import SensorModel
-from lidargrit.simulator.kitti_car import hidden_by_car, is_on_car
+from lidargrit.simulator.kitti_car import SENSORS_ON_CAR, hidden_by_car
 
 REVOLUTION_S = 0.1  # KITTI's sensor turns at 10 Hz: Geiger et al., IJRR 2013, section 2
 
@@ -123,7 +123,7 @@ def _aims(sensor: SensorModel) -> tuple[np.ndarray, ...]:
         columns = -aside * (fine.width / (2 * math.pi))  # to the right is positive, as columns are counted
         phase = columns - np.round(columns)
         turn = (azimuth - aside) / (2 * math.pi) % 1
-    clear = ~hidden_by_car(azimuth, elevation) if is_on_car(sensor) else True
+    clear = ~hidden_by_car(azimuth, elevation) if sensor.name in SENSORS_ON_CAR else True
     clear = np.broadcast_to(clear, (fine.height, fine.width))
     azimuth, elevation, turn, phase = (table.astype(np.float32) for table in (azimuth, elevation, turn, phase))
     return elevation, azimuth, turn, phase, clear

@@ -114,11 +114,7 @@ def _corners(
         own = slice(part * corners.shape[1], (part + 1) * corners.shape[1])
         range_m, triangle = np.full(len(wide), np.inf, np.float32), np.full(len(wide), NOTHING, np.int32)
         cos = np.zeros(len(wide), np.float32)
-        range_m[wide], triangle[wide], cos[wide] = (
-            found.range_m[own],
-            found.triangle[own],
-            found.cos_incidence[own],
-        )
+        range_m[wide], triangle[wide], cos[wide] = (found.range_m[own], found.triangle[own], found.cos_incidence[own])
         hits.append(Hits(range_m, triangle, cos))
     return hits
 

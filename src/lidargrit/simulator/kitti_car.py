@@ -3,9 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lidargrit.scans.sensors import SensorModel
-
-_SENSORS = ("hdl64e_kitti_360", "hdl64e_kitti_odometry")
+SENSORS_ON_CAR = ("hdl64e_kitti_360", "hdl64e_kitti_odometry")
 
 # Measured in 67 scans of KITTI, which docs/results/simulator-against-kitti.md names: azimuths, in whole degrees, at
 # which fewer than half of them return anything. One line a laser, by its elevation in degrees. No two lasers see the
@@ -38,11 +36,6 @@ _HIDDEN_DEG = (
     (-23.64, ((-144, -126), (-89, -88), (-82, -76), (-40, -28), (-20, 20), (25, 30), (31, 38), (125, 213))),
 )
 # fmt: on
-
-
-def is_on_car(sensor: SensorModel) -> bool:
-    """Return whether a sensor is KITTI's own on its car: one of the two of this package, by name."""
-    return sensor.name in _SENSORS
 
 
 def hidden_by_car(

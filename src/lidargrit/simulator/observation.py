@@ -187,10 +187,7 @@ def observe_scene(
 
 
 def _beside(
-    tracer: Tracer,
-    beams: Beams,
-    poses: tuple[Float64[np.ndarray, "4 4"], ...],
-    stride: int,
+    tracer: Tracer, beams: Beams, poses: tuple[Float64[np.ndarray, "4 4"], ...], stride: int
 ) -> tuple[Float32[np.ndarray, "H W"], Float32[np.ndarray, "H W"]]:
     """Cast the fine columns to the left and to the right of every ``stride``-th."""
     found = []
@@ -198,13 +195,6 @@ def _beside(
         looked = beams.columns(slice(start, None, stride))
         found.append(tracer.cast(*looked.rays(*poses)).range_m.reshape(looked.azimuth_rad.shape))
     return np.roll(found[0], 1, axis=1), found[1]
-
-
-def _object_gains(finish: Finish, rng: np.random.Generator, model: RaydropModel) -> Float32[np.ndarray, " objects"]:
-    """Sample the natural log of the gain of every object by its number; what is no single object has none."""
-    gains = rng.standard_normal(int(finish.instance.max()) + 1, dtype=np.float32) * np.float32(model.object_spread)
-    gains[0] = 0
-    return gains
 
 
 def _measure(
@@ -223,7 +213,9 @@ def _measure(
     shape, lasers = beams.azimuth_rad.shape, Lasers.of(setup, len(beams.azimuth_rad))
     label = np.append(finish.label, np.uint16(0))[echoes.triangle]
     instance = np.append(finish.instance, np.int32(0))[echoes.triangle]
-    of_object = _object_gains(finish, scene_rng, model)[instance]
+    gains = np.float32(model.object_spread) * scene_rng.standard_normal(finish.instance.max() + 1, dtype=np.float32)
+    gains[0] = 0  # what is no single object has none
+    of_object = gains[instance]
     log_gain = (lasers.log_gain + beam_noise.patch).ravel() + of_object
     level = levels(echoes.power, log_gain, model)
     clear = beams.clear.ravel() & (echoes.range_m >= limits_m[0]) & (echoes.range_m <= limits_m[1])

@@ -69,16 +69,11 @@ class RaydropModel:
     materials: tuple[Material, ...] = MATERIALS
 
     def __post_init__(self) -> None:
-        for fits, got, wanted in (
-            (self.least_power > 0, f"least_power={self.least_power:g}", "a power above 0"),
-            (
-                self.patch_deg >= _PATCH_AT_LEAST_DEG,
-                f"patch_deg={self.patch_deg:g}",
-                f"{_PATCH_AT_LEAST_DEG:g} or more",
-            ),
-        ):
-            if not fits:  # also for NaN
-                raise ConfigError(got, wanted, "correct the raydrop model")
+        if not self.least_power > 0:  # also for NaN
+            raise ConfigError(f"least_power={self.least_power:g}", "a power above 0", "correct the raydrop model")
+        if not self.patch_deg >= _PATCH_AT_LEAST_DEG:
+            wanted = f"{_PATCH_AT_LEAST_DEG:g} or more"
+            raise ConfigError(f"patch_deg={self.patch_deg:g}", wanted, "correct the raydrop model")
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,11 +62,7 @@ _PANDAR64 = SensorSetup(
     weak_dimming=0.0,
     height_m=2.08,
 )
-PACKAGED: Final = {
-    "hdl64e_kitti_odometry": _HDL64E_OF_ODOMETRY,
-    "hdl64e_kitti_360": _KITTI,
-    "pandar64": _PANDAR64,
-}
+PACKAGED: Final = {"hdl64e_kitti_odometry": _HDL64E_OF_ODOMETRY, "hdl64e_kitti_360": _KITTI, "pandar64": _PANDAR64}
 """Set-up of each packaged sensor of which there are scans; in KITTI-360's images several lasers meet in one row."""
 
 

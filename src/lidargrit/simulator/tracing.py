@@ -31,10 +31,7 @@ class Hits:
 
 
 def in_reach(
-    mesh: Mesh,
-    poses: Sequence[Float64[np.ndarray, "4 4"]],
-    elevations_rad: tuple[float, float],
-    range_max_m: float,
+    mesh: Mesh, poses: Sequence[Float64[np.ndarray, "4 4"]], elevations_rad: tuple[float, float], range_max_m: float
 ) -> Mesh:
     """Leave out triangles that no ray can meet: too far, or wholly above or below all rays.
 

@@ -40,12 +40,7 @@ PlotProgress = Callable[[Generator, str, RangeImages, Path], None]
 """Plots what a half-trained generator makes at a stage, beside validation scans, into a file."""
 
 
-def train(
-    preset: Preset,
-    folder: Path,
-    plot: PlotProgress | None = None,
-    wandb_project: str = "",
-) -> Generator:
+def train(preset: Preset, folder: Path, plot: PlotProgress | None = None, wandb_project: str = "") -> Generator:
     """Train every stage of a preset in a run folder and return the finished generator.
 
     The same call resumes a stopped training. Before the first step, the folder holds ``run.json`` (preset, command,
@@ -81,16 +76,12 @@ def train(
 
 
 def _train(
-    preset: Preset,
-    checked: CheckedStages,
-    opened: OpenedData,
-    folder: Path,
-    plot: PlotProgress | None,
-    engine: Engine,
+    preset: Preset, checked: CheckedStages, opened: OpenedData, folder: Path, plot: PlotProgress | None, engine: Engine
 ) -> Generator:
     train_images = joined_images(opened.train, preset.data)
     val_images = joined_images(opened.val, preset.data)
-    _warn_of_overlap(train_images, val_images)
+    if shared := train_images.provenance.overlap(val_images.provenance):
+        reporting.message(f"WARNING: train and val overlap ({shared}): scores on val flatter the model")
     checked.check_images("data.train", train_images)
     checked.check_images("data.val", val_images)
     with torch.random.fork_rng(range(torch.cuda.device_count())):  # the caller's own random numbers stay as they are
@@ -206,11 +197,6 @@ def _write_trained_on(folder: Path, train_images: RangeImages, runs: Iterable[st
         return
     learned = [train_images.provenance, *(trained_on(locate(run)) for run in sorted({*runs}))]
     write_trained_on(folder, Provenance.joined(learned))
-
-
-def _warn_of_overlap(train_images: RangeImages, val_images: RangeImages) -> None:
-    if shared := train_images.provenance.overlap(val_images.provenance):
-        reporting.message(f"WARNING: train and val overlap ({shared}): scores on val flatter the model")
 
 
 def _commit() -> str:

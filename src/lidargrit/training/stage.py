@@ -162,9 +162,8 @@ class StageTraining:
                     note = f"loss {float(terms['loss']):.4f}  {self.engine.peak_gib():.1f} GiB"
                 progress.advance(config.batch_size, note)
                 if logs:
-                    self._log_terms(
-                        "train", {name: float(term) for name, term in terms.items()}, time.monotonic() - begun
-                    )
+                    found = {name: float(term) for name, term in terms.items()}
+                    self._log_terms("train", found, time.monotonic() - begun)
                 if saves:
                     self._save()  # before anything that may fail, or take longer than a terminated process has
                 if stops:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from lidargrit.evaluation.metrics import ImageKind
 from lidargrit.evaluation.metrics.shared.curves import CurveMetric, Curves, divergence
@@ -35,6 +35,10 @@ class BevOccupancy(CurveMetric):
         times = occupied.sum(dim=0).numpy()
         return np.stack((np.full_like(times, len(images)), times))
 
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " x"]:
+        """Return the middles of cells."""
+        return np.arange(_CELLS) - _HALF_M + 0.5
+
     def curves(
         self, generated: Int64[np.ndarray, "2 x y"], real: Int64[np.ndarray, "2 x y"], kind: ImageKind
     ) -> Curves:
@@ -43,4 +47,4 @@ class BevOccupancy(CurveMetric):
         ever = (shares[0] > 0) | (shares[1] > 0)
         yes_and_no = [np.stack((share[ever], 1 - share[ever]), axis=-1) for share in shares]
         mean = float(divergence(*yes_and_no).mean()) if ever.any() else 0.0
-        return Curves(mean, np.arange(_CELLS) - _HALF_M + 0.5, *shares)
+        return Curves(mean, self.axis(kind), *shares)

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from lidargrit.evaluation.metrics import ImageKind
-from lidargrit.evaluation.metrics.shared.curves import CurveMetric, Curves, compare_histograms, histogram, middles
+from lidargrit.evaluation.metrics.shared.curves import CurveMetric, histogram, middles
 from lidargrit.scans.types import RangeImage
 
 
@@ -26,12 +26,9 @@ class DropRunLengths(CurveMetric):
         """Count the runs in bins of length."""
         return histogram(run_lengths(images.return_mask).float(), _edges(ImageKind.of(images.sensor)))
 
-    def curves(
-        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of runs over their length."""
-        edges = _edges(kind)
-        return compare_histograms(generated, real, middles(edges))
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return lengths of runs."""
+        return middles(_edges(kind))
 
 
 def _edges(kind: ImageKind) -> Float64[np.ndarray, " edges"]:

@@ -39,9 +39,8 @@ class FlyingPoints(ShareMetric):
         gap_m = torch.where(images.return_mask, far_m - near_m, torch.nan)
         flying = (images.range_m > near_m + _OFF_M) & (images.range_m < far_m - _OFF_M)
         bins = np.digitize(gap_m.numpy(), _EDGES_M) - 1  # NaN comes after the last bin
-        counts = [
-            np.bincount(bins[chosen], minlength=len(_EDGES_M)) for chosen in (bins >= 0, (bins >= 0) & flying.numpy())
-        ]
+        shown = bins >= 0
+        counts = [np.bincount(bins[some], minlength=len(_EDGES_M)) for some in (shown, shown & flying.numpy())]
         return np.stack(counts)[:, : len(_EDGES_M) - 1]
 
     def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:

@@ -1,17 +1,10 @@
 """Distribution of range, row by row: two sets → Jensen-Shannon distance, the root of the mean over rows."""
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from lidargrit.evaluation.metrics import ImageKind
-from lidargrit.evaluation.metrics.shared.curves import (
-    CurveMetric,
-    Curves,
-    compare_histograms,
-    histogram,
-    middles,
-    range_edges,
-)
+from lidargrit.evaluation.metrics.shared.curves import CurveMetric, histogram, middles, range_edges
 from lidargrit.scans.types import RangeImage
 
 _BINS = 32  # of 120 m / 0.9 m: each reaches a sixth farther than the one before
@@ -33,8 +26,6 @@ class RangeHistogramPerRing(CurveMetric):
         rows = zip(images.range_m.transpose(0, 1), images.return_mask.transpose(0, 1), strict=True)
         return np.stack([histogram(range_m[returned], edges) for range_m, returned in rows])
 
-    def curves(
-        self, generated: Int64[np.ndarray, "H bins"], real: Int64[np.ndarray, "H bins"], kind: ImageKind
-    ) -> Curves:
-        """Return one histogram a row."""
-        return compare_histograms(generated, real, middles(range_edges(kind, _BINS)))
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return ranges."""
+        return middles(range_edges(kind, _BINS))

@@ -2,11 +2,11 @@
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from lidargrit.core.errors import DataError
 from lidargrit.evaluation.metrics import ImageKind
-from lidargrit.evaluation.metrics.shared.curves import CurveMetric, Curves, compare_histograms
+from lidargrit.evaluation.metrics.shared.curves import CurveMetric
 from lidargrit.scans.types import RangeImage
 
 _STEPS = 50  # bins of 0.02, two of the hundredths that KITTI's files hold
@@ -31,8 +31,6 @@ class ReflectanceHistogram(CurveMetric):
         index = (values * _STEPS + 0.25).long()  # a quarter: no hundredth falls on the edge of a bin
         return torch.bincount(index, minlength=_STEPS + 1).numpy()
 
-    def curves(
-        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of returns over the reflectance."""
-        return compare_histograms(generated, real, (np.arange(_STEPS + 1) + 0.25) / _STEPS)
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return reflectances."""
+        return (np.arange(_STEPS + 1) + 0.25) / _STEPS

@@ -91,7 +91,8 @@ class SlicedWasserstein(ImageMetric):
         rng = self._shared_positions().after_images(n) if reference else torch.Generator().manual_seed(self.seed)
         details: dict[str, Any] = {}
         first = 0
-        for level, num_patches in enumerate(self._patches_per_level()):
+        for level, size in enumerate(self._level_sizes()):
+            num_patches = _PATCHES if self.variant == "textbook" else min(_PATCHES, size)
             part = slice(first, first := first + num_patches)
             samples = (torch.from_numpy(each[:n, part].reshape(-1, _PATCH**2)) for each in (generated, real))
             patches = [standardised(sample, int(reference)) for sample in samples]
@@ -107,9 +108,6 @@ class SlicedWasserstein(ImageMetric):
         assert self.kind is not None
         rows, columns = self.kind.height, self.kind.width
         return [num_positions(rows >> level, columns >> level) for level in range(num_levels(rows, columns))]
-
-    def _patches_per_level(self) -> list[int]:
-        return [_PATCHES if self.variant == "textbook" else min(_PATCHES, size) for size in self._level_sizes()]
 
     def _shared_positions(self) -> "SharedPositions":
         if self._shared is None:

@@ -2,19 +2,12 @@
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.evaluation.metrics import ImageKind
-from lidargrit.evaluation.metrics.shared.curves import (
-    ONE_SURFACE,
-    CurveMetric,
-    Curves,
-    compare_histograms,
-    log_edges,
-    middles,
-)
+from lidargrit.evaluation.metrics.shared.curves import ONE_SURFACE, CurveMetric, log_edges, middles
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 
@@ -54,11 +47,9 @@ class WallStraightness(CurveMetric):
         off_m = distance_from_line(points_xyz_m[..., 0], points_xyz_m[..., 1])[runs]
         return np.histogram(off_m.clamp(*_EDGES_M[[0, -1]].tolist()).numpy(), _EDGES_M)[0]
 
-    def curves(
-        self, generated: Int64[np.ndarray, " bins"], real: Int64[np.ndarray, " bins"], kind: ImageKind
-    ) -> Curves:
-        """Return the share of runs over their distance from a line."""
-        return compare_histograms(generated, real, middles(_EDGES_M))
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " bins"]:
+        """Return distances from a line."""
+        return middles(_EDGES_M)
 
 
 def unbroken_runs(images: RangeImage) -> Bool[Tensor, "B H W"]:

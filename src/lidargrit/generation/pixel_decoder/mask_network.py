@@ -11,13 +11,7 @@ from torch import Tensor, nn
 from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.pixel_decoder.phase_network import Guide, PhaseNetwork, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.phase_noise import COLUMN_RAD, ROW_RAD, PhaseNoise, following
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    at_phases,
-    cells_of,
-    one_of_phases,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, cells_of, one_of_phases
 from lidargrit.nn.random import of_host, rngs_of
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
@@ -86,15 +80,11 @@ class MaskNetwork(PhaseNetwork):
             return self.noise(torch.rand((self.sensor.height, self.sensor.width), generator=rng), rng, shares)
 
         numbers = [of(rng) for rng in rngs]
-        every = (
-            [] if earlier_seeds is None else [[one for one in seeds if one >= 0] for seeds in earlier_seeds.tolist()]
-        )
-        seeds = sorted({one for some in every for one in some})
-        drawn = {
-            seed: of(rng) for seed, rng in zip(seeds, rngs_of(seeds), strict=True)
-        }  # images of one scan share them
-        for at, some in enumerate(every):
-            numbers[at] = following(numbers[at], [drawn[seed] for seed in some])
+        if earlier_seeds is not None:
+            every = [[seed for seed in seeds if seed >= 0] for seeds in earlier_seeds.tolist()]
+            seeds = sorted({seed for some in every for seed in some})  # images of one scan share them
+            drawn = {seed: of(rng) for seed, rng in zip(seeds, rngs_of(seeds), strict=True)}
+            numbers = [following(own, [drawn[seed] for seed in some]) for own, some in zip(numbers, every, strict=True)]
         return torch.stack(numbers).to(self.before.device)
 
     def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:

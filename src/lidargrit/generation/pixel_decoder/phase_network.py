@@ -12,15 +12,9 @@ from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count, NotNegative, Share
 from lidargrit.core.untrusted import TEMPERATURE_AT_LEAST
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    cells_of,
-    generated_before,
-    phases_of,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, cells_of, generated_before, phases_of
 from lidargrit.generation.pixel_decoder.ray_encoding import LEAST_CELL, RowEncoding, coarsest_cell_of
-from lidargrit.nn.blocks import Network
+from lidargrit.nn.blocks import Network, zeroed
 from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.precision import at_least_32_bits
 from lidargrit.scans.sensors import SensorModel
@@ -172,10 +166,7 @@ class LatticeNetwork(Network):
         self.guide, self.context = Convolution(guide, width, "wrap"), Convolution(context, width, "wrap")
         self.phase_bias = nn.Parameter(torch.zeros(phases, width))
         self.blocks = nn.Sequential(*(Residual(width) for _ in range(blocks)))
-        self.out = nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases))
-        for layer in self.out:
-            nn.init.zeros_(layer.get_parameter("weight"))
-            nn.init.zeros_(layer.get_parameter("bias"))
+        self.out = zeroed(nn.ModuleList(nn.Conv2d(width, outputs, 1) for _ in range(phases)))
 
     def forward(
         self, guided: Float[Tensor, "B C h w"], contexts: Float[Tensor, "P B D h w"], first: int

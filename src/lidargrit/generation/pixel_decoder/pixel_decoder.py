@@ -16,16 +16,10 @@ from lidargrit.generation.any_sensor import RayNetwork
 from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.pixel_decoder.mask_network import MaskNetwork
 from lidargrit.generation.pixel_decoder.phase_network import Guide, PixelDecoderConfig
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    at_phases,
-    join_phases,
-    one_of_phases,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, join_phases, one_of_phases
 from lidargrit.generation.pixel_decoder.range_network import RangeNetwork
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.nn.collectives import mean_over_processes
+from lidargrit.nn.collectives import num_processes, sum_over_processes
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.random import of_host
 from lidargrit.scans.condition import Observed
@@ -33,9 +27,8 @@ from lidargrit.scans.planes import planes_of
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Decoded, RangeImage
 
-_Guided = tuple[
-    dict[Lattice, Tensor], dict[Lattice, Tensor]
-]  # by lattice: the guide's part of the first layers, of both
+# By lattice: the guide's part of the first layers, of both networks.
+_Guided = tuple[dict[Lattice, Tensor], dict[Lattice, Tensor]]
 
 _ALL_PHASES_AREA = 16  # training counts all phases of lattices with one in so many pixels, or fewer
 
@@ -201,8 +194,8 @@ class PixelDecoder(RayNetwork):
             mask_nats = mask_nats + share * of_mask.sum()
             range_nats = range_nats + share * of_range.sum()
             returns = returns + share * at_phases(images.return_mask, chosen).sum()
-        if self.training:  # as many returns as one process with the whole batch would divide by, for each process
-            returns = mean_over_processes(returns)
+        if self.training:  # the mean over processes of part / mean is the sum of the parts over that of the returns
+            returns = sum_over_processes(returns) / num_processes()
         return mask_nats / pixels, range_nats / returns.clamp(min=1)
 
     @property

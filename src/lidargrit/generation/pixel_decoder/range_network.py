@@ -8,13 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lidargrit.generation.pixel_decoder.phase_network import Guide, PhaseNetwork, PixelDecoderConfig
-from lidargrit.generation.pixel_decoder.pixel_phases import (
-    Lattice,
-    Phase,
-    at_phases,
-    cells_of,
-    pixels_around,
-)
+from lidargrit.generation.pixel_decoder.pixel_phases import Lattice, Phase, at_phases, cells_of, pixels_around
 from lidargrit.generation.pixel_decoder.range_candidates import RangeCandidates
 from lidargrit.generation.pixel_decoder.range_mixture import SURFACE_V, RangeMixture
 from lidargrit.scans.sensors import SensorModel

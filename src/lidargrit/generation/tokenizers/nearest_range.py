@@ -14,6 +14,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count
 from lidargrit.generation.pixel_decoder.range_mixture import RangeMixture
 from lidargrit.generation.tokenizers import Tokenizer, TokenizerConfig
+from lidargrit.nn.blocks import zeroed
 from lidargrit.nn.codes import CodeFeatures
 from lidargrit.nn.convolution import Convolution, Residual
 from lidargrit.nn.flops import flops_of
@@ -115,8 +116,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         self.conv_in = Convolution(inputs, config.width, "wrap")
         self.blocks = nn.Sequential(*(Residual(config.width) for _ in range(config.blocks)))
         self.to_pixels = nn.Conv2d(config.width, config.features * rows * columns, 1)
-        self.conv_out = nn.Conv2d(self.num_features, 3 * components + 1, 1)
-        nn.init.zeros_(self.conv_out.weight)
+        self.conv_out = zeroed(nn.Conv2d(self.num_features, 3 * components + 1, 1))
         with torch.no_grad():  # a pixel is at its own cell's range, the more if its part is, until more is learned
             bias, own = torch.zeros(3, components), _SHIFTS.index((0, 0))
             bias[0, own] = _HEAD_START
@@ -164,7 +164,8 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
 
     def decoding_flops(self) -> int:
         """Return the floating-point operations of decoding one scan."""
-        cells, pixels = (1, self.config.width, *self.grid_size), (1, self.num_features, *self._size)
+        cells = (1, self.config.width, *self.grid_size)
+        pixels = (1, self.num_features, self.sensor.height, self.sensor.width)
         counted = flops_of(self.conv_in, (1, self.conv_in.in_channels, *self.grid_size))
         counted += flops_of(self.blocks, cells) + flops_of(self.to_pixels, cells) + flops_of(self.conv_out, pixels)
         return counted
@@ -189,10 +190,6 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
                 "mask_accuracy": ((return_logits >= 0) == mask).float().mean(),
             }
         return {"loss": terms["range_nats"] + terms["raydrop"], **terms, **errors}
-
-    @property
-    def _size(self) -> tuple[int, int]:
-        return self.sensor.height, self.sensor.width
 
     def _cells(self, pixels: Float[Tensor, "B H W"]) -> Float[Tensor, "B h w p q"]:
         (rows, columns), (height, width) = (self.config.cell_rows, self.config.cell_columns), self.grid_size

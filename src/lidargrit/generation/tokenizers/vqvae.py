@@ -215,9 +215,8 @@ class Vqvae(ConvolutionalTokenizer[VqvaeConfig]):
         encoded = self.range_encoding.encode(images.range_m, images.return_mask)
         if not self.config.reflectance:
             return encoded[:, None]
-        return torch.stack(
-            (encoded, 2 * required_reflectance(images.reflectance, _SETTING) * images.return_mask - 1), 1
-        )
+        reflectance = required_reflectance(images.reflectance, _SETTING)
+        return torch.stack((encoded, 2 * reflectance * images.return_mask - 1), 1)
 
     def decode(self, tokens: TokenGrid) -> Decoded:
         """Return clean range, return logits, perhaps reflectance, and the last feature maps of a batch of tokens."""

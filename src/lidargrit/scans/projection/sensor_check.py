@@ -31,9 +31,8 @@ _SECTORS_AT_LEAST = 27  # with a return: KITTI's scans have all, a crop to the c
 _MISPLACED_AT_MOST = 0.125
 _POINTS_FOR_ORDER = 100  # fewer do not show an order
 _POINTS_MEASURED, _POINTS_FOR_HEIGHT = 8192, 512
-_WITHIN_RINGS_AT_MOST = (
-    0.1  # share of the elevations' variance; 0.01 in files stored ring by ring, 0.9 in shuffled ones
-)
+# Share of the elevations' variance: 0.01 in files stored ring by ring, 0.9 in shuffled ones.
+_WITHIN_RINGS_AT_MOST = 0.1
 _TWO_RINGS = 0.4  # of a row's height, between two points of one pixel: they are of two lasers
 # Real scans in their own sensor's rows: up to 0.07 of the pixels, 0.17 in the 64 equal rows of KITTI-360's literature;
 # scans of 64 or 128 lasers in half as many rows: 0.5 and more.

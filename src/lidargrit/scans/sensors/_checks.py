@@ -49,9 +49,8 @@ _TABLES = {"elevation_rad": 2, "azimuth_rad": 2, "azimuth_offset_rad": 1}  # wit
 _MAY_BE_LEFT_OUT = {"source", "column_stride", "azimuth_offset_rad", "first_edge_rad"}
 _ROWS_AT_MOST = 4096  # sensors have up to 256 lasers; a table beyond this is a mistake that would fill the memory
 FINE_COLUMNS_AT_MOST = 65536  # sensors fire up to 4096 times a revolution
-_PIXELS_AT_MOST = (
-    2**24
-)  # 128 rows of 4096 columns have a thirtieth; images of a stranger's sensor would fill the memory
+# 128 rows of 4096 columns have a thirtieth; images of a stranger's sensor would fill the memory.
+_PIXELS_AT_MOST = 2**24
 _APART_AT_MOST = 0.75  # of a column: published programs take the edges of columns, half a column from the centres
 _EDGE_ASIDE_AT_MOST_RAD = math.radians(1)
 _MEASURED_APART_AT_MOST_RAD = math.radians(5)

@@ -57,9 +57,8 @@ class Houses:
         away = plan.nearest_approach_m(points_m)
         hides = np.flatnonzero((plan.nearest_approach_m(self.poses.xyz_m) < _OCCLUDERS_TO_M) & ~self.plain)
         beside = np.flatnonzero((away > 12.0) & (away < _HIDDEN_M))
-        from_x, from_y = self._into(
-            hides, plan.viewpoints_m
-        )  # (houses, eyes): lines of sight in the frame of each house
+        # (houses, eyes): lines of sight in the frame of each house
+        from_x, from_y = self._into(hides, plan.viewpoints_m)
         to_x, to_y = self._into(hides, points_m[beside, :2])
         spans = []
         with np.errstate(divide="ignore", invalid="ignore"):  # a line along a wall counts as free
@@ -354,13 +353,10 @@ def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: House
     floor = storey * houses.storey_m[home]
     slab = boxes(rows_of(x - half, face - out, floor - 0.15), rows_of(x + half, face, floor))
     rail = boxes(rows_of(x - half, face - out, floor), rows_of(x + half, face - out + 0.06, floor + 0.95))
-    balcony = np.stack((slab, rail), axis=1)[hung]
-    builder.add(
-        houses.poses.of(home[hung]).to_world(balcony), materials.CONCRETE, albedo[hung][:, None, None], classes.BUILDING
-    )
+    balcony = houses.poses.of(home[hung]).to_world(np.stack((slab, rail), axis=1)[hung])
+    builder.add(balcony, materials.CONCRETE, albedo[hung][:, None, None], classes.BUILDING)
     bays = np.flatnonzero((kind > 0.5) & (kind < 0.75))
     tall = houses.height_m[home] * np.where(half > 1.2, 1.0, 0.45)
     bay = boxes(rows_of(x - half, face - out * 0.6, -_SINK_M), rows_of(x + half, face + 0.05, tall))[bays]
-    builder.add(
-        houses.poses.of(home[bays]).to_world(bay), material[bays][:, None], albedo[bays][:, None], classes.BUILDING
-    )
+    bay = houses.poses.of(home[bays]).to_world(bay)
+    builder.add(bay, material[bays][:, None], albedo[bays][:, None], classes.BUILDING)

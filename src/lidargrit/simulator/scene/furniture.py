@@ -10,7 +10,7 @@ from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.mesh import Shape
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
-from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, fans, lathe, leaves, loft, sweep
+from lidargrit.simulator.scene.shapes import ShapeBuilder, fans, lathe, leaves, loft, sweep
 
 _POLE, _FACE, _BACK, _BODY, _STONE, _GREEN, _PANE, _BOARD, _RAIL = range(9)
 _MATERIALS = (materials.METAL, materials.FOIL, materials.METAL, materials.PAINT, materials.CONCRETE, materials.LEAVES,
@@ -42,7 +42,7 @@ def _lamp(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     arm = np.column_stack((reach * np.sin(turn), 0 * turn, tall + 0.5 * (1 - np.cos(turn))))
     builder.add(_POLE, sweep(arm, np.full(6, 0.035), 6))
     tip = arm[-1]
-    builder.add(_POLE, boxes(tip + np.array([-0.1, -0.15, -0.06]), tip + np.array([0.55, 0.15, 0.08])))
+    builder.add_box(_POLE, tip + np.array([-0.1, -0.15, -0.06]), tip + np.array([0.55, 0.15, 0.08]))
 
 
 def _sign(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -75,8 +75,8 @@ def _guide(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 def _signal(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     tall = rng.uniform(3.0, 3.6)
     _mast(builder, tall, 0.06, 1.0)
-    builder.add(_BODY, boxes(np.array([-0.28, -0.15, tall - 1.0]), np.array([-0.06, 0.15, tall - 0.05])))
-    builder.add(_BODY, boxes(np.array([-0.2, -0.12, 2.0]), np.array([-0.05, 0.12, 2.0 + 0.3])))
+    builder.add_box(_BODY, (-0.28, -0.15, tall - 1.0), (-0.06, 0.15, tall - 0.05))
+    builder.add_box(_BODY, (-0.2, -0.12, 2.0), (-0.05, 0.12, 2.0 + 0.3))
 
 
 def _bin(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -95,17 +95,17 @@ def _bin(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 def _cabinet(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A cabinet of a power or telephone company, with a roof that overhangs."""
     half, tall = np.array([rng.uniform(0.15, 0.22), rng.uniform(0.3, 0.8)]), rng.uniform(0.9, 1.5)
-    builder.add(_BODY, boxes(np.array([*-half, -0.2]), np.array([*half, tall])))
-    builder.add(_BODY, boxes(np.array([*-(half + 0.03), tall]), np.array([*(half + 0.03), tall + 0.05])))
+    builder.add_box(_BODY, (*-half, -0.2), (*half, tall))
+    builder.add_box(_BODY, (*-(half + 0.03), tall), (*(half + 0.03), tall + 0.05))
 
 
 def _bench(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A bench that faces along -x."""
     half = rng.uniform(0.7, 1.0)
     for z, x in ((0.44, -0.1), (0.44, 0.06), (0.44, 0.22), (0.62, 0.32), (0.8, 0.37)):
-        builder.add(_BODY, boxes(np.array([x - 0.06, -half, z - 0.02]), np.array([x + 0.06, half, z + 0.02])))
+        builder.add_box(_BODY, (x - 0.06, -half, z - 0.02), (x + 0.06, half, z + 0.02))
     for y in (-half + 0.1, half - 0.1):
-        builder.add(_POLE, boxes(np.array([-0.15, y - 0.03, -0.1]), np.array([0.3, y + 0.03, 0.43])))
+        builder.add_box(_POLE, (-0.15, y - 0.03, -0.1), (0.3, y + 0.03, 0.43))
 
 
 def _planter(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -129,13 +129,13 @@ def _column(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 def _shelter(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A bus shelter with glass at its back and one end, open along -x."""
     half = rng.uniform(1.4, 2.2)
-    builder.add(_BODY, boxes(np.array([-0.8, -half - 0.1, 2.3]), np.array([0.8, half + 0.1, 2.42])))
+    builder.add_box(_BODY, (-0.8, -half - 0.1, 2.3), (0.8, half + 0.1, 2.42))
     for x, y in ((0.65, -half), (0.65, 0.0), (0.65, half), (-0.6, -half), (-0.6, half)):
         builder.add(_POLE, sweep(np.array([(x, y, -0.1), (x, y, 2.3)]), np.full(2, 0.045), 6))
     panes = [[(0.65, -half, 0.2), (0.65, half, 0.2), (0.65, half, 2.2), (0.65, -half, 2.2)],
              [(-0.6, half, 0.2), (0.65, half, 0.2), (0.65, half, 2.2), (-0.6, half, 2.2)]]  # fmt: skip
     builder.add(_PANE, fans(np.array(panes)))
-    builder.add(_BODY, boxes(np.array([0.25, -half + 0.3, 0.42]), np.array([0.55, half - 0.3, 0.48])))
+    builder.add_box(_BODY, (0.25, -half + 0.3, 0.42), (0.55, half - 0.3, 0.48))
 
 
 def _bollard(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -148,7 +148,7 @@ def _meter(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A parking meter or letter box on a post."""
     _mast(builder, 1.1, 0.045, 1.0)
     high = rng.uniform(0.4, 0.65)
-    builder.add(_BODY, boxes(np.array([-0.16, -0.2, 1.0]), np.array([0.12, 0.2, 1.0 + high])))
+    builder.add_box(_BODY, (-0.16, -0.2, 1.0), (0.12, 0.2, 1.0 + high))
 
 
 def _hoarding(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -157,15 +157,14 @@ def _hoarding(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     if rng.random() < 0.6:
         for x in np.arange(-half, half, HOARDING_M / 4):  # boards stand a little before and behind one another
             deep = rng.uniform(0.0, 0.04)
-            low, high = np.array([x, deep - 0.03, 0.05]), np.array([x + HOARDING_M / 4, deep + 0.03, tall])
-            builder.add(_BOARD, boxes(low, high))
+            builder.add_box(_BOARD, (x, deep - 0.03, 0.05), (x + HOARDING_M / 4, deep + 0.03, tall))
         return
     for x in np.linspace(-half, half, 40):
-        builder.add(_RAIL, boxes(np.array([x - 0.012, -0.012, 0.15]), np.array([x + 0.012, 0.012, tall])))
+        builder.add_box(_RAIL, (x - 0.012, -0.012, 0.15), (x + 0.012, 0.012, tall))
     for x in (-half, 0.0, half):
-        builder.add(_STONE, boxes(np.array([x - 0.12, -0.35, -0.05]), np.array([x + 0.12, 0.35, 0.14])))
+        builder.add_box(_STONE, (x - 0.12, -0.35, -0.05), (x + 0.12, 0.35, 0.14))
     for z in (0.15, tall - 0.05):
-        builder.add(_RAIL, boxes(np.array([-half, -0.02, z]), np.array([half, 0.02, z + 0.04])))
+        builder.add_box(_RAIL, (-half, -0.02, z), (half, 0.02, z + 0.04))
 
 
 def _railing(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -173,9 +172,9 @@ def _railing(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     half, tall = RAILING_M / 2, rng.uniform(0.95, 1.1)
     for x in np.linspace(-half, half, int(rng.choice([3, 17]))):
         wide = 0.03 if abs(abs(x) - half) < 0.01 or not x else 0.012
-        builder.add(_RAIL, boxes(np.array([x - wide, -wide, -0.1]), np.array([x + wide, wide, tall])))
+        builder.add_box(_RAIL, (x - wide, -wide, -0.1), (x + wide, wide, tall))
     for z in (0.12, tall / 2, tall):
-        builder.add(_RAIL, boxes(np.array([-half, -0.025, z - 0.03]), np.array([half, 0.025, z + 0.03])))
+        builder.add_box(_RAIL, (-half, -0.025, z - 0.03), (half, 0.025, z + 0.03))
 
 
 def _scaffold(builder: ShapeBuilder, rng: np.random.Generator) -> None:
@@ -184,32 +183,28 @@ def _scaffold(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     tall = 2.0 * storeys + 1.0
     for x in (-half, 0.0, half):
         for y in (-0.4, 0.4):
-            builder.add(_POLE, boxes(np.array([x - 0.03, y - 0.03, -0.2]), np.array([x + 0.03, y + 0.03, tall])))
+            builder.add_box(_POLE, (x - 0.03, y - 0.03, -0.2), (x + 0.03, y + 0.03, tall))
     for z in 2.0 * np.arange(1, storeys + 1) + 0.2:
-        builder.add(_BODY, boxes(np.array([-half, -0.4, z]), np.array([half, 0.4, z + 0.05])))
+        builder.add_box(_BODY, (-half, -0.4, z), (half, 0.4, z + 0.05))
         for rail in (0.5, 1.0):
             for y in (-0.4, 0.4):
-                low, high = np.array([-half, y - 0.025, z + rail]), np.array([half, y + 0.025, z + rail + 0.05])
-                builder.add(_POLE, boxes(low, high))
+                builder.add_box(_POLE, (-half, y - 0.025, z + rail), (half, y + 0.025, z + rail + 0.05))
 
 
 def _stall(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A stall or kiosk that is open along -y: a counter, a back and a roof that overhangs."""
     half, deep, tall = rng.uniform(1.0, 1.8), rng.uniform(0.6, 1.0), rng.uniform(2.3, 2.7)
-    builder.add(_BODY, boxes(np.array([-half, -deep, 0.0]), np.array([half, -deep + 0.5, 0.95])))
-    builder.add(_BODY, boxes(np.array([-half, deep - 0.06, 0.0]), np.array([half, deep, tall])))
-    builder.add(
-        _BODY, boxes(np.array([-half - 0.2, -deep - 0.5, tall]), np.array([half + 0.2, deep + 0.1, tall + 0.1]))
-    )
+    builder.add_box(_BODY, (-half, -deep, 0.0), (half, -deep + 0.5, 0.95))
+    builder.add_box(_BODY, (-half, deep - 0.06, 0.0), (half, deep, tall))
+    builder.add_box(_BODY, (-half - 0.2, -deep - 0.5, tall), (half + 0.2, deep + 0.1, tall + 0.1))
     for x in (-half, half):
-        builder.add(_POLE, boxes(np.array([x - 0.04, -deep, 0.0]), np.array([x + 0.04, -deep + 0.08, tall])))
+        builder.add_box(_POLE, (x - 0.04, -deep, 0.0), (x + 0.04, -deep + 0.08, tall))
 
 
 def _box(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A skip, a container for glass, a toilet hut or a pile of crates: a body that widens upwards, with a rim."""
-    length, wide, tall = rng.choice(
-        [(1.8, 0.9, 1.3), (0.75, 0.75, 1.7), (0.55, 0.55, 2.2), (0.6, 0.4, 1.2)]
-    ) * rng.uniform(0.9, 1.1, 3)
+    sizes = [(1.8, 0.9, 1.3), (0.75, 0.75, 1.7), (0.55, 0.55, 2.2), (0.6, 0.4, 1.2)]
+    length, wide, tall = rng.choice(sizes) * rng.uniform(0.9, 1.1, 3)
     corner = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     slope = rng.uniform(0.8, 1.0)
     outline = ((slope, 0.0), (1.0, tall - 0.12), (1.05, tall - 0.12), (1.05, tall))
@@ -221,7 +216,7 @@ def _box(builder: ShapeBuilder, rng: np.random.Generator) -> None:
 def _bed(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """A low wall, or a raised bed with shrubs."""
     half, wide, tall = rng.uniform(1.2, 3.5), rng.uniform(0.15, 0.6), rng.uniform(0.4, 0.9)
-    builder.add(_STONE, boxes(np.array([-half, -wide, -0.2]), np.array([half, wide, tall])))
+    builder.add_box(_STONE, (-half, -wide, -0.2), (half, wide, tall))
     if wide > 0.3:
         number = int(160 * half)
         way = rng.uniform(-1, 1, (number, 3)) * np.array([half, wide, 0.3]) + np.array([0, 0, tall + 0.3])
@@ -232,8 +227,8 @@ def _rack(builder: ShapeBuilder, rng: np.random.Generator) -> None:
     """Stands to which bicycles are locked, in a row along y."""
     for y in np.arange(int(rng.integers(3, 8))) * 0.9:
         for low, high in ((-0.38, -0.33), (0.33, 0.38)):
-            builder.add(_POLE, boxes(np.array([low, y - 0.025, -0.1]), np.array([high, y + 0.025, 0.8])))
-        builder.add(_POLE, boxes(np.array([-0.38, y - 0.025, 0.8]), np.array([0.38, y + 0.025, 0.85])))
+            builder.add_box(_POLE, (low, y - 0.025, -0.1), (high, y + 0.025, 0.8))
+        builder.add_box(_POLE, (-0.38, y - 0.025, 0.8), (0.38, y + 0.025, 0.85))
 
 
 (LAMP, SIGN, GUIDE, SIGNAL, BIN, CABINET, BENCH, PLANTER, COLUMN, SHELTER, BOLLARD, METER, HOARDING, RAILING, SCAFFOLD,

@@ -14,16 +14,14 @@ def greenery(rng: np.random.Generator, plan: StreetPlan, town: Settlement) -> li
     """Plant trees and bushes: along pavements, in gardens and parks, and in rows and woods in the country."""
     green = rng.uniform(0.3, 1.0)
     lots = [*_parks(rng, town), *(_woods(rng, plan.stretch) if plan.theme == "country" else [])]
-    count = rng.poisson(
-        {"city": 90, "suburb": 160, "country": 60}[plan.theme] * green * plan.stretch.share_around(55.0)
-    )
+    usual = {"city": 90, "suburb": 160, "country": 60}[plan.theme]
+    count = rng.poisson(usual * green * plan.stretch.share_around(55.0))
     lots.append(np.column_stack((plan.stretch.around(rng, 55.0, count), rng.normal(0, 45, count))))
     trees = [_plantable(plan, town, np.concatenate(lots), 2.2), *_tree_rows(rng, plan)]
     u, v = _clear_of_bridge(plan, *np.concatenate(trees).T)
     wood = make_trees(rng, plan, u, v, size=rng.uniform(0.8, 1.3), rise_m=plan.level_m[1])
-    count = rng.poisson(
-        {"city": 45, "suburb": 170, "country": 60}[plan.theme] * green * plan.stretch.share_around(35.0)
-    )
+    usual = {"city": 45, "suburb": 170, "country": 60}[plan.theme]
+    count = rng.poisson(usual * green * plan.stretch.share_around(35.0))
     points = [np.column_stack((plan.stretch.around(rng, 35.0, count), rng.normal(0, 18, count))), *_parks(rng, town)]
     u, v = _clear_of_bridge(plan, *_plantable(plan, town, np.concatenate(points), 1.0).T)
     return [*wood, make_bushes(rng, u, v, plan.level_m[1]), *_thickets(rng, plan, town)]

@@ -268,11 +268,7 @@ def _met(plan: StreetPlan, u_m: np.ndarray, turn_rad: float | np.ndarray, speed_
 
 
 def traffic(
-    rng: np.random.Generator,
-    plan: StreetPlan,
-    town: Settlement,
-    oncoming_m_s: float = 0.0,
-    first_instance: int = 1,
+    rng: np.random.Generator, plan: StreetPlan, town: Settlement, oncoming_m_s: float = 0.0, first_instance: int = 1
 ) -> list[ObjectBatch]:
     """Sample all vehicles, people and bicycles, each with an instance of its own.
 
@@ -297,14 +293,11 @@ def traffic(
     kinds[placements.across] = HATCHBACK  # short drives and narrow streets
     groups = [make_vehicles(rng, kinds, placements, first_instance)]
     following = first_instance + len(placements)
-    walkers = _walkers(rng, plan)
-    if len(walkers):
-        groups.append(make_walkers(rng, walkers, following))
-    following += len(walkers)
-    riders = _riders(rng, plan)
-    if len(riders):
-        groups.append(make_cyclists(rng, riders, following))
-    following += len(riders)
+    for sample, make in ((_walkers, make_walkers), (_riders, make_cyclists)):
+        people = sample(rng, plan)
+        if len(people):
+            groups.append(make(rng, people, following))
+        following += len(people)
     count = rng.poisson(1.2 * plan.stretch.share(40.0)) if plan.theme != "country" else 0
     side = rng.choice([-1, 1], count)
     v = np.where(side > 0, plan.front(1) - 0.5, plan.front(-1) + 0.5)
@@ -339,9 +332,8 @@ def _riders(rng: np.random.Generator, plan: StreetPlan) -> Placements:
 def _walkers(rng: np.random.Generator, plan: StreetPlan) -> Placements:
     count = rng.poisson(_WALKERS[plan.theme] * plan.stretch.share_around(28.0))
     side = rng.choice([-1, 1], count)
-    across = np.where(side > 0, *plan.edge_m[::-1]) + np.where(side > 0, *plan.pavement_m[::-1]) * rng.uniform(
-        0.3, 0.9, count
-    )
+    edge_m, pavement_m = np.where(side > 0, *plan.edge_m[::-1]), np.where(side > 0, *plan.pavement_m[::-1])
+    across = edge_m + pavement_m * rng.uniform(0.3, 0.9, count)
     speed = np.where(rng.random(count) < 0.75, rng.uniform(0.7, 1.8, count), 0.0)
     u = plan.stretch.around(rng, 28.0, count)
     if plan.stretch is Stretch.FIRST:

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Num
+from numpy.typing import ArrayLike
 
 from lidargrit.simulator.mesh import Mesh, Shape
 
@@ -71,6 +72,10 @@ class ShapeBuilder:
         flat = flat[np.linalg.norm(normal, axis=1) > 1e-7]
         self._triangles.append(flat)
         self._parts.append(np.full(len(flat), part, np.uint8))
+
+    def add_box(self, part: int, low_m: ArrayLike, high_m: ArrayLike) -> None:
+        """Add an upright box between its low and its high corner to a part."""
+        self.add(part, boxes(np.array(low_m), np.array(high_m)))
 
     def build(self) -> Shape:
         """Return the shape."""

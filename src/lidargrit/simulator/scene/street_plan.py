@@ -241,10 +241,7 @@ class StreetPlan:
         return blocks(corners)
 
     def in_side_street(
-        self,
-        u_m: Num[np.ndarray, "*s"],
-        v_m: Num[np.ndarray, "*s"],
-        spare_m: float | Float[np.ndarray, "*s"] = 0.0,
+        self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"], spare_m: float | Float[np.ndarray, "*s"] = 0.0
     ) -> Float[np.ndarray, "*s"]:
         """Return by how many metres points lie inside a side street (negative: outside all)."""
         inside = np.full(np.broadcast_shapes(np.shape(u_m), np.shape(v_m)), -np.inf)

@@ -11,7 +11,7 @@ from lidargrit.simulator import materials
 from lidargrit.simulator.mesh import Shape
 from lidargrit.simulator.scene.body_types import BODY_TYPES, BUS, LORRY, PANEL_VAN, SHARES, BodyType
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
-from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, fans, lathe, loft, quads
+from lidargrit.simulator.scene.shapes import ShapeBuilder, fans, lathe, loft, quads
 
 VARIANTS = 10  # of each body type
 _PAINT, _GLASS, _RUBBER, _METAL, _DARK, _PLATE, _CARGO = range(7)
@@ -119,8 +119,7 @@ def _running_gear(builder: ShapeBuilder, body: _Body) -> None:
             foot = inner[[0, -1]] - np.array([0, 0, radius - kind.clearance_m])
             builder.add(_DARK, fans(np.concatenate((foot[:1], inner, foot[1:]))))
     ends, half = body.x_m(np.array([0.97, 0.03])), body.width_m * 0.32
-    builder.add(_DARK, boxes(np.array([ends[0], -half, kind.clearance_m]),
-                             np.array([ends[1], half, kind.clearance_m + 0.1])))  # fmt: skip
+    builder.add_box(_DARK, (ends[0], -half, kind.clearance_m), (ends[1], half, kind.clearance_m + 0.1))
 
 
 def _cabin(builder: ShapeBuilder, body: _Body) -> None:
@@ -131,17 +130,14 @@ def _cabin(builder: ShapeBuilder, body: _Body) -> None:
     for row in kind.seats:
         back = float(body.x_m(row))
         for y in (-half / 2 - 0.03, half / 2 + 0.03):
-            low, high = np.array([back - 0.12, y - 0.24, belt - 0.5]), np.array([back, y + 0.24, belt + 0.16])
-            builder.add(_DARK, boxes(low, high))
-            builder.add(_DARK, boxes(np.array([back - 0.11, y - 0.13, belt + 0.18]),
-                                     np.array([back - 0.02, y + 0.13, belt + 0.38])))  # fmt: skip
+            builder.add_box(_DARK, (back - 0.12, y - 0.24, belt - 0.5), (back, y + 0.24, belt + 0.16))
+            builder.add_box(_DARK, (back - 0.11, y - 0.13, belt + 0.18), (back - 0.02, y + 0.13, belt + 0.38))
     start, stop = max(kind.windows[0][0] - 0.06, 0.03), max(span[1] for span in (*kind.windows, kind.rear_screen))
-    floor = boxes(np.array([body.x_m(stop), -half, 0.42]), np.array([body.x_m(start), half, belt - 0.3]))
-    builder.add(_DARK, floor)
+    builder.add_box(_DARK, (float(body.x_m(stop)), -half, 0.42), (float(body.x_m(start)), half, belt - 0.3))
     mirror = kind.windows[0][0] + 0.02
     for side in (-1, 1):
         corner = np.array([body.x_m(mirror) - 0.07, side * (body.width_m / 2 + 0.09) - 0.09, belt + 0.0])
-        builder.add(_PAINT, boxes(corner, corner + np.array([0.1, 0.18, 0.14 if kind.seats[0] > 0.3 else 0.3])))
+        builder.add_box(_PAINT, corner, corner + np.array([0.1, 0.18, 0.14 if kind.seats[0] > 0.3 else 0.3]))
     for end, low in ((1, 0.42), (-1, 0.52 if kind.wheel_m < 0.42 else 0.6)):  # 0.52 x 0.11 m as in Europe
         x = end * (body.length_m / 2 + 0.015)
         corners = [(x, y, z) for y, z in ((-0.26, low), (0.26, low), (0.26, low + 0.11), (-0.26, low + 0.11))]
@@ -157,11 +153,10 @@ def _cargo(builder: ShapeBuilder, body: _Body) -> None:
     rings = ring + np.stack((np.linspace(tail, nose, 6), np.zeros(6), np.zeros(6)), axis=1)[:, None]
     builder.add(_CARGO, loft(rings[None]))
     builder.add(_CARGO, fans(rings[[0, -1]]))
-    builder.add(_DARK, boxes(np.array([tail, -0.45, 0.6]), np.array([nose, 0.45, 1.05])))
+    builder.add_box(_DARK, (tail, -0.45, 0.6), (nose, 0.45, 1.05))
     for side in (-1, 1):  # the guard between the axles, and the lamps' beam behind
         y = side * (half - 0.08)
-        rail = boxes(np.array([body.x_m(0.62), y - 0.03, 0.45]), np.array([body.x_m(0.34), y + 0.03, 0.85]))
-        builder.add(_METAL, rail)
+        builder.add_box(_METAL, (float(body.x_m(0.62)), y - 0.03, 0.45), (float(body.x_m(0.34)), y + 0.03, 0.85))
 
 
 @cache

@@ -16,9 +16,7 @@ _CUT = 0.5  # of rows and of columns
 
 
 def augment_differentiably(
-    images: Float[Tensor, "B 1 H W"],
-    kinds: Sequence[DifferentiableAugmentation],
-    rng: torch.Generator,
+    images: Float[Tensor, "B 1 H W"], kinds: Sequence[DifferentiableAugmentation], rng: torch.Generator
 ) -> Float[Tensor, "B 1 H W"]:
     """Change every image of a batch at random, so that gradients flow through to it.
 

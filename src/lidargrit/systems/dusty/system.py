@@ -29,10 +29,7 @@ from lidargrit.scans.projection import RangeEncoding
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import MaskDecoding, RangeImage
 from lidargrit.systems.dusty.dcgan import LEVELS, Discriminator, Synthesis, Widths, from_published
-from lidargrit.systems.dusty.differentiable_augmentation import (
-    DifferentiableAugmentation,
-    augment_differentiably,
-)
+from lidargrit.systems.dusty.differentiable_augmentation import DifferentiableAugmentation, augment_differentiably
 
 
 def logistic_noise(size: tuple[int, ...], rng: torch.Generator) -> Float[Tensor, "..."]:

@@ -23,5 +23,5 @@ PRESETS = {
             average_over_scans=600,
             start="pretrained/lidargrit",
         ),
-    ),
+    )
 }

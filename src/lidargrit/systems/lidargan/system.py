@@ -22,13 +22,7 @@ from lidargrit.scans.example import Example
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
 from lidargrit.systems.lidargan.filled_rows import FilledRows
-from lidargrit.systems.lidargan.networks import (
-    Decoder,
-    Encoder,
-    InitialStd,
-    read_published_sizes,
-    relativistic_loss,
-)
+from lidargrit.systems.lidargan.networks import Decoder, Encoder, InitialStd, read_published_sizes, relativistic_loss
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,7 @@ from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.tokenizers import Tokenizer
-from lidargrit.generation.tokens import (
-    DecodingOfTokens,
-    TokenGenerator,
-    TokenGeneratorConfig,
-    TokenObjective,
-)
+from lidargrit.generation.tokens import DecodingOfTokens, TokenGenerator, TokenGeneratorConfig, TokenObjective
 from lidargrit.nn.decoding import CachedDecoder, WeightPrecision, flops_of_step
 from lidargrit.nn.published import read_checkpoint
 from lidargrit.nn.random import of_host, rngs_of, sample_index

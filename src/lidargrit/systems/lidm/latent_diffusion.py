@@ -48,10 +48,7 @@ def ddim_steps(steps: int) -> Int[Tensor, "t"]:
 
 
 def ddim(
-    denoiser: LatentDenoiser,
-    noise: Callable[[], Float[Tensor, "B D h w"]],
-    steps: int,
-    eta: float,
+    denoiser: LatentDenoiser, noise: Callable[[], Float[Tensor, "B D h w"]], steps: int, eta: float
 ) -> Float[Tensor, "B D h w"]:
     """Sample latents.
 

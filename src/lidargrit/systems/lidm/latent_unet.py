@@ -4,7 +4,6 @@ Parameter names follow the reference's state dict, so that published weights loa
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -132,9 +131,6 @@ class LatentUnet(Network):
 
 class _Steps(nn.ModuleList):
     """Layers one after the other, of which the residual blocks also get the embedding of the time step."""
-
-    def __init__(self, layers: Iterable[nn.Module]) -> None:
-        super().__init__(layers)
 
     def forward(self, x: Float[Tensor, "B C h w"], embedding: Float[Tensor, "B E"]) -> Float[Tensor, "B D i j"]:
         for layer in self:

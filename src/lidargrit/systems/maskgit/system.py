@@ -15,12 +15,7 @@ from lidargrit.core.untrusted import STEPS_AT_MOST
 from lidargrit.generation.batches import BatchSeeds
 from lidargrit.generation.facts import Cost, SystemFacts
 from lidargrit.generation.objective import Objective
-from lidargrit.generation.tokens import (
-    DecodingOfTokens,
-    TokenGenerator,
-    TokenGeneratorConfig,
-    TokenObjective,
-)
+from lidargrit.generation.tokens import DecodingOfTokens, TokenGenerator, TokenGeneratorConfig, TokenObjective
 from lidargrit.nn.precision import Precision, autocast_to
 from lidargrit.nn.random import gumbel_of, rngs_of, sample_index
 from lidargrit.nn.transformer import MaskedTransformer
@@ -122,9 +117,8 @@ class HiddenTokens(TokenObjective):
         tokens, unigram_nll = self.encode(example)
         count, length = tokens.shape
         # Each scan's progress is uniform in [0, 1); within a batch they are evenly spread, which calms the loss.
-        progress = (
-            torch.rand(1, generator=rng, device=rng.device) + torch.arange(count, device=rng.device) / count
-        ) % 1
+        apart = torch.arange(count, device=rng.device) / count
+        progress = (torch.rand(1, generator=rng, device=rng.device) + apart) % 1
         hidden_each = (share_hidden(progress) * length).ceil().clamp(min=1)
         rank = torch.rand(tokens.shape, generator=rng, device=rng.device).argsort(dim=1).argsort(dim=1)
         hidden = (rank < hidden_each[:, None]).to(tokens.device)
@@ -168,14 +162,11 @@ def generate_tokens(
         uniform = torch.stack([torch.rand(2, length, generator=rng) for rng in rngs], dim=1).to(device)
         with autocast_to(sampling.weights, device):
             logits = transformer(tokens).float()
-        sampled = _sample(logits, uniform[0], sampling.temperature)
+        cold = sampling.temperature == 0
+        sampled = logits.argmax(dim=-1) if cold else sample_index(logits / sampling.temperature, uniform[0])
         confidence = logits.log_softmax(dim=-1).gather(-1, sampled[..., None])[..., 0]
         confidence += sampling.order_temperature * (1 - done / len(schedule)) * gumbel_of(uniform[1])
         hidden = tokens == transformer.mask_token
         kept = confidence.masked_fill(~hidden, torch.inf).topk(length - left, dim=1).indices
         tokens = tokens.scatter(1, kept, torch.where(hidden, sampled, tokens).gather(1, kept))
     return tokens
-
-
-def _sample(logits: Tensor, uniform: Tensor, temperature: float) -> Tensor:
-    return logits.argmax(dim=-1) if temperature == 0 else sample_index(logits / temperature, uniform)

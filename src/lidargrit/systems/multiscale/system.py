@@ -54,12 +54,10 @@ class Multiscale(Generator[MultiscaleConfig, PixelSampling]):
         return PixelObjective(self.pixels)
 
     def _sample(self, seeds: BatchSeeds, condition: Condition, sampling: PixelSampling) -> RangeImage:
-        rngs = rngs_of(seeds)
-        return self.pixels.sample(None, rngs, sampling)
+        return self.pixels.sample(None, rngs_of(seeds), sampling)
 
     def _complete(self, condition: Observed, seeds: BatchSeeds, sampling: PixelSampling) -> RangeImage:
-        rngs = rngs_of(seeds)
-        return self.pixels.sample(None, rngs, sampling, condition)
+        return self.pixels.sample(None, rngs_of(seeds), sampling, condition)
 
     def _bits(self, images: RangeImage, steps: RangeSteps, expected: bool) -> ScanBits:
         """Return the bits of mask and ranges; there are no tokens, which take none."""

@@ -91,9 +91,7 @@ def read_r2dm_checkpoint(path: Path) -> tuple[UnetConfig, bool, dict[str, Tensor
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         reason = str(error).partition("\n")[0][:100]
         raise CheckpointError(
-            f"{path}, which cannot be read ({type(error).__name__}: {reason})",
-            _WANTED,
-            _CURE,
+            f"{path}, which cannot be read ({type(error).__name__}: {reason})", _WANTED, _CURE
         ) from None
     _check_sizes(path, unet, weights)
     return unet, reflectance, weights

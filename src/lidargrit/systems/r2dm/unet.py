@@ -53,7 +53,8 @@ class UnetConfig(Settings):
                 "as many residual_blocks as channel_multipliers",
                 "correct them",
             )
-        if self.channels % self.norm_groups or self._has_split_heads():
+        splits_heads = any(width % self.attention_heads for width in self.widths()[-2:])
+        if self.channels % self.norm_groups or splits_heads:
             raise ConfigError(
                 f"channels={self.channels} with {self.norm_groups} norm_groups, {self.attention_heads} attention_heads",
                 "a multiple of both",
@@ -63,9 +64,6 @@ class UnetConfig(Settings):
     def widths(self) -> list[int]:
         """Return the channels of the input's convolution and of each level."""
         return [self.channels, *(self.channels * multiplier for multiplier in self.channel_multipliers)]
-
-    def _has_split_heads(self) -> bool:
-        return any(width % self.attention_heads for width in self.widths()[-2:])
 
 
 class EfficientUnet(Network):
@@ -82,11 +80,7 @@ class EfficientUnet(Network):
     coords: Tensor
 
     def __init__(
-        self,
-        config: UnetConfig,
-        images: int,
-        elevation_rad: Float[Tensor, "H W"],
-        azimuth_rad: Float[Tensor, "H W"],
+        self, config: UnetConfig, images: int, elevation_rad: Float[Tensor, "H W"], azimuth_rad: Float[Tensor, "H W"]
     ) -> None:
         super().__init__()
         height, width = elevation_rad.shape

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lidargrit.core.configuration import Settings
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.typed_values import Bounds, Count
-from lidargrit.nn.blocks import Block, Network
+from lidargrit.nn.blocks import Block, Network, zeroed
 
 _ROWS = 3  # of the window, as R2Flow has it
 _REACH = 4  # columns of the window on each side of the token
@@ -112,11 +112,7 @@ class Hdit(Network):
     coords: Tensor
 
     def __init__(
-        self,
-        config: HditConfig,
-        images: int,
-        elevation_rad: Float[Tensor, "H W"],
-        azimuth_rad: Float[Tensor, "H W"],
+        self, config: HditConfig, images: int, elevation_rad: Float[Tensor, "H W"], azimuth_rad: Float[Tensor, "H W"]
     ) -> None:
         super().__init__()
         height, width = elevation_rad.shape
@@ -134,7 +130,9 @@ class Hdit(Network):
         patch = (1, _COLUMNS_PER_TOKEN)
         self.tokenizer = nn.Sequential(nn.Conv2d(images, widths[0], patch, patch, bias=False))
         self.spatial_pe = _Positions(tokens, widths[0])
-        self.timestep_pe = nn.Sequential(_Frequencies(config.time_channels), _time_layers(config.time_channels))
+        n = config.time_channels
+        parts = _Frequencies(n), nn.Sequential(_Rms(n), _TimeFeedForward(n), _TimeFeedForward(n), _Rms(n))
+        self.timestep_pe = nn.Sequential(*parts)
         self.down_levels, self.up_levels = nn.ModuleDict(), nn.ModuleDict()
         for level in range(self.coarsest):
             self.down_levels[f"level_{level}"] = _blocks(config, level, tokens)
@@ -190,10 +188,6 @@ class _Frequencies(nn.Module):
     def forward(self, time: Tensor) -> Tensor:
         phases = 2 * math.pi * time[:, None] * self.freqs
         return self.linear(torch.cat((phases.cos(), phases.sin()), dim=-1))
-
-
-def _time_layers(channels: int) -> nn.Sequential:
-    return nn.Sequential(_Rms(channels), _TimeFeedForward(channels), _TimeFeedForward(channels), _Rms(channels))
 
 
 def _blocks(config: HditConfig, level: int, tokens: tuple[int, int]) -> nn.ModuleList:
@@ -361,6 +355,4 @@ class _Expand(nn.Module):
 
 def _zero_linear(inputs: int, outputs: int) -> nn.Linear:
     """Return a linear layer of zeros, so that a new block adds nothing."""
-    layer = nn.Linear(inputs, outputs, bias=False)
-    nn.init.zeros_(layer.weight)
-    return layer
+    return zeroed(nn.Linear(inputs, outputs, bias=False))

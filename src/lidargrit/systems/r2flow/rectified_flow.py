@@ -208,9 +208,8 @@ class FlowPairs(Frozen[Hdit]):
         if numbers.is_meta:  # without values, where operations are only counted
             empty = numbers.new_empty((len(numbers), *self._shape), dtype=torch.float32)
             return empty, empty
-        noise = SeededNoise(
-            [scan_seed(_PAIRS_SEED, number) for number in numbers.tolist()], self._shape, numbers.device
-        )()
+        seeds = [scan_seed(_PAIRS_SEED, number) for number in numbers.tolist()]
+        noise = SeededNoise(seeds, self._shape, numbers.device)()
         clean = [self._clean(number, noise[[index]]) for index, number in enumerate(numbers.tolist())]
         return noise, torch.cat(clean).to(noise)
 

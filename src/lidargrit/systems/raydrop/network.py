@@ -110,10 +110,7 @@ class RaydropNetwork(RayNetwork):
         return RaydropNetwork(self.config, sensor)
 
     def forward(
-        self,
-        range_m: Float[Tensor, "B H W"],
-        surface: Bool[Tensor, "B H W"],
-        label: Int[Tensor, "B H W"] | None = None,
+        self, range_m: Float[Tensor, "B H W"], surface: Bool[Tensor, "B H W"], label: Int[Tensor, "B H W"] | None = None
     ) -> RaydropOutput:
         """Return features and logits of every ray.
 

@@ -8,12 +8,7 @@ from lidargrit.systems.raydrop.network import RaydropNetworkConfig
 from lidargrit.systems.raydrop.system import RaydropConfig
 
 _RAYDROP = replace(
-    LATER_STAGE,
-    scans=4000,
-    batch_size=4,
-    augmentations=("flip",),
-    average_over_scans=300,
-    validation_scans=32,
+    LATER_STAGE, scans=4000, batch_size=4, augmentations=("flip",), average_over_scans=300, validation_scans=32
 )
 
 PRESETS = {

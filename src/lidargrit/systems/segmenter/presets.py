@@ -19,5 +19,5 @@ PRESETS = {
             average_over_scans=300,
             validation_scans=32,
         ),
-    ),
+    )
 }

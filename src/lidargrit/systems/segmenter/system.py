@@ -174,8 +174,7 @@ class Segmenter(Generator[SegmenterConfig, SamplingSettings]):
     Config = SegmenterConfig
     trains = (("segmenter", "segmenter"),)
     facts = SystemFacts(
-        generates="a label for every return of a scan; no scans",
-        first_command="segment SCANS labelled --model RUN",
+        generates="a label for every return of a scan; no scans", first_command="segment SCANS labelled --model RUN"
     )
     is_random = False
     has_new_scans = False

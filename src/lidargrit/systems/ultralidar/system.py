@@ -221,7 +221,8 @@ class UltraLidar(Generator[UltraLidarConfig, VoxelSampling]):
     def cost(self, sampling: VoxelSampling | None = None) -> Cost:
         """Return the passes through prior, decoder and encoder, with the search for the nearest codes."""
         sampling, rounds = sampling or VoxelSampling(), (sampling or VoxelSampling()).rounds
-        flops = (sampling.steps + rounds) * _prior_flops(self.prior, self.config.autoencoder)
+        (rows, columns), code_dim = self.config.autoencoder.tokens, self.config.autoencoder.code_dim
+        flops = (sampling.steps + rounds) * flops_of(self.prior, (1, rows * columns, code_dim))
         flops += (1 + rounds) * self.autoencoder.decoding_flops() + rounds * self.autoencoder.encoding_flops()
         return Cost(sampling.steps + 1 + 3 * rounds, flops)
 
@@ -329,7 +330,3 @@ def _training_voxels(
         for axis, coin in zip((-1, -2), coins, strict=True):
             voxels = torch.where(coin, voxels.flip(axis), voxels)
     return voxels.float()
-
-
-def _prior_flops(prior: VoxelPrior, sizes: VoxelAutoencoderConfig) -> int:
-    return flops_of(prior, (1, sizes.tokens[0] * sizes.tokens[1], sizes.code_dim))

@@ -66,8 +66,13 @@ class CurveMetric(ImageMetric):
         """Count in a batch; counts of batches add up."""
 
     @abstractmethod
+    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " n"]:
+        """Return the position of each value along the axis."""
+
     def curves(self, generated: Int64[np.ndarray, "..."], real: Int64[np.ndarray, "..."], kind: ImageKind) -> Curves:
-        """Turn the counts of both sets into curves and compare these."""
+        """Compare histograms, one or one a row: the mean divergence of the rows."""
+        mean = float(divergence(generated, real).mean())
+        return Curves(mean, self.axis(kind), normalised(generated), normalised(real))
 
     @final
     def summarise(self, features: RangeImage, *, real: bool) -> Int64[np.ndarray, "..."]:
@@ -149,13 +154,6 @@ def enough_trials(generated: Int64[np.ndarray, "2 n"], real: Int64[np.ndarray, "
     """Return which bins have at least 500 trials in both sets; if none has, those with any."""
     trials = np.minimum(generated[0], real[0])
     return trials >= _LEAST if (trials >= _LEAST).any() else trials > 0
-
-
-def compare_histograms(
-    generated: Int64[np.ndarray, "*rows n"], real: Int64[np.ndarray, "*rows n"], axis: Float64[np.ndarray, " n"]
-) -> Curves:
-    """Compare histograms, one or one a row: the mean divergence of the rows."""
-    return Curves(float(divergence(generated, real).mean()), axis, normalised(generated), normalised(real))
 
 
 def log_edges(low: float, high: float, bins: int) -> Float64[np.ndarray, " edges"]:
@@ -265,10 +263,6 @@ class ShareMetric(CurveMetric):
     @abstractmethod
     def count(self, images: RangeImage) -> Int64[np.ndarray, "2 n"]:
         """Count the trials of each bin in a batch and, among them, those in which it happened."""
-
-    @abstractmethod
-    def axis(self, kind: ImageKind) -> Float64[np.ndarray, " n"]:
-        """Return the position of each bin along the axis."""
 
     @final
     def curves(self, generated: Int64[np.ndarray, "2 n"], real: Int64[np.ndarray, "2 n"], kind: ImageKind) -> Curves:

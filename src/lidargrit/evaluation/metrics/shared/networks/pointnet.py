@@ -1,7 +1,5 @@
 """PointNet, trained to tell 16 kinds of objects apart: clouds in unit space → 1808 features of each."""
 
-from collections.abc import Callable
-
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -56,10 +54,11 @@ class _PerPoint(nn.Module):
         self.conv3, self.bn3 = nn.Conv1d(128, 1024, 1), FrozenNorm(1024)
 
     def pooled(self, points: Float[Tensor, "B 3 n"]) -> Float[Tensor, "B 1024"]:
-        return _largest(points, lambda x: self.bn3(self.conv3(self._hidden(x))))
+        return torch.stack([self._features(some).amax(dim=2) for some in points.split(_POINTS, dim=2)]).amax(dim=0)
 
-    def _hidden(self, x: Tensor) -> Tensor:
-        return F.relu(self.bn2(self.conv2(F.relu(self.bn1(self.conv1(x))))))
+    def _features(self, x: Tensor) -> Tensor:
+        x = F.relu(self.bn1(self.conv1(x)))
+        return self.bn3(self.conv3(F.relu(self.bn2(self.conv2(x)))))
 
 
 class _Alignment(_PerPoint):
@@ -84,7 +83,3 @@ class _GlobalFeatures(_PerPoint):
 
     def forward(self, points: Tensor) -> Tensor:
         return self.pooled(self.stn(points).mT @ points)
-
-
-def _largest(points: Tensor, features: Callable[[Tensor], Tensor]) -> Tensor:
-    return torch.stack([features(some).amax(dim=2) for some in points.split(_POINTS, dim=2)]).amax(dim=0)
