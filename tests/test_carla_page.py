@@ -50,6 +50,7 @@ def test_the_pages_lines_give_one_point_to_every_pixel_and_keep_left_and_right(t
     assert torch.allclose(image.range_m[:, torch.sin(sensor.azimuth_rad[0]) > -0.49], torch.tensor(20.0))
 
 
+@pytest.mark.filterwarnings("ignore:.*have fewer columns")
 def test_the_callback_keeps_some_of_the_points_as_they_are_and_turns_right_to_left():
     callback: dict = {}
     exec(lines_of_page()[2], callback)

@@ -11,6 +11,7 @@ import lidargrit
 from lidargrit.core.errors import ConfigError, DataError, ScanError, UnknownNameError
 from lidargrit.data import formats
 from lidargrit.data.sources.memory import MemorySource
+from lidargrit.inference.complete import tasks
 from lidargrit.scans.classes import BUILDING, CLASS_BITS, ROAD
 from lidargrit.scans.types import RangeImage
 
@@ -171,9 +172,11 @@ def test_range_images_in_memory_are_scored_as_the_samples_that_they_are(scan):
         lidargrit.complete(images[0])
 
 
-def test_another_sensor_than_the_points_is_doubted_aloud(scan, nearest):
+def test_another_sensor_than_the_points_is_doubted_aloud_and_once(scan, nearest, monkeypatch):
+    monkeypatch.setattr(tasks, "_doubted", set())
     with pytest.warns(UserWarning, match="of two lasers"):
         lidargrit.upsample(scan.points_xyz_m, "vlp16", nearest)
+    lidargrit.upsample(scan.points_xyz_m[1000:], "vlp16", nearest)
     card = lidargrit.evaluate([scan], [scan], metrics=["point_cloud_jsd"], sensor="vlp16")
     assert any("of two lasers" in warning for warning in card.warnings)
     with pytest.raises(ConfigError, match="vlp16"):

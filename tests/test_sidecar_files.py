@@ -8,6 +8,7 @@ import pytest
 
 from lidargrit.core.discovery import names
 from lidargrit.core.errors import OutputError
+from lidargrit.core.files import remembered
 from lidargrit.data import formats
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.datasets.argoverse2 import Argoverse2
@@ -56,18 +57,22 @@ def test_a_calibration_belongs_to_the_scans_of_its_log(named, tmp_path):
     assert calibration.parent.parent == dataset.path(0).parents[2]
 
 
-def test_metadata_that_changes_opens_a_recording_anew(tmp_path, monkeypatch):
-    """The packets stay as they are; what is read of both is kept in memory until one of the files changes."""
-    opened = []
-    monkeypatch.setattr(ouster_pcap, "_open_once", lambda *key: opened.append(key) or (None, None, 0.0, np.zeros(1)))
+def test_what_was_read_is_kept_until_one_of_its_files_changes(tmp_path):
+    read = []
+
+    @remembered(lambda path: [path, path.with_suffix(".json")])
+    def opened(path):
+        read.append(path.with_suffix(".json").read_text() if path.with_suffix(".json").exists() else "")
+        return read[-1]
+
     recording, metadata = tmp_path / "a.pcap", tmp_path / "a.json"
-    recording.write_bytes(b"packets")
     assert ouster_pcap.OusterPcap.sidecar_files(recording) == (metadata,)
-    for text in (json.dumps({"a": 1}), json.dumps({"a": 1}), json.dumps({"a": 10})):
-        if not metadata.exists() or metadata.read_text() != text:
-            metadata.write_text(text)
-        ouster_pcap._open(recording)
-    assert opened[0] == opened[1] != opened[2]
+    assert [opened(recording), opened(recording)] == ["", ""]
+    metadata.write_text("1")
+    assert [opened(recording), opened(recording)] == ["1", "1"]
+    metadata.write_text("10")
+    assert opened(recording) == "10"
+    assert read == ["", "1", "10"]
 
 
 def test_elevations_that_change_move_the_points(real, tmp_path):

@@ -16,11 +16,13 @@ from lidargrit.inference.complete.inputs import InputScan, ScanReader
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.inference.complete.sparse import SparseReader, observed_rows
 from lidargrit.scans.condition import ConditionKind, Observed
+from lidargrit.scans.many_scans import untold
 from lidargrit.scans.projection import ProjectionVariant
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
 
 _TRAIN_RAYDROP = "lidargrit train raydrop_compact RUN --set data.sensor=SENSOR"
+_doubted = set[str]()  # what callers of the Python API were warned of
 
 
 class Task(ABC):
@@ -185,8 +187,8 @@ def complete_scan(scan: Scan, model: Model, task: Task | None = None, seed: int 
     check_seeds([seed])
     task = task or Fill(Pattern("returns"))
     seen = task.see(scan, model)
-    if seen.doubt:
-        warnings.warn(seen.doubt, stacklevel=3)  # at whoever called the function of the Python API
+    for doubt in untold([seen.doubt] if seen.doubt else [], _doubted):
+        warnings.warn(doubt, stacklevel=3)  # at whoever called the function of the Python API
     seeds = seen.rays.seeds(seed)
     condition = seen.rays.beside_one_another(task.condition(seen, derive_seed(seed)), seeds)
     return task.result(seen, condition, complete_images(model, condition, seeds))
