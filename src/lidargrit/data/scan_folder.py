@@ -274,10 +274,8 @@ class KittiTree:
         ordered = sorted(of_files)
         if ordered != [f"sequences/{sequence}/velodyne/{number:06d}.bin" for number in range(len(ordered))]:
             ordered = [file for file in ordered if (self._out / file).exists()]
-            folder = self._out / "sequences" / sequence / "velodyne"
-            if len(ordered) < sum(1 for _ in folder.glob("*.bin")):
-                return []
-        return [of_files[file] for file in ordered]
+        there = sum(1 for _ in (self._out / "sequences" / sequence / "velodyne").glob("*.bin"))
+        return [] if len(ordered) < there else [of_files[file] for file in ordered]
 
 
 def write_with_labels(path: Path, scan: Scan) -> None:

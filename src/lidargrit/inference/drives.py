@@ -16,7 +16,6 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import scan_seed
 from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.core.files import sha256_of_json
-from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.run_folder import locate
 from lidargrit.data.scan_folder import KittiTree, ScanFolder, ScanIdentity
@@ -27,7 +26,7 @@ from lidargrit.generation.generator import Generator, SamplingT, load
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.scans.condition import NOTHING, Condition
 from lidargrit.scans.fine_columns import in_fine_columns
-from lidargrit.scans.motion import transform_between
+from lidargrit.scans.motion import Motion, transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.types import RangeImage, Scan
@@ -69,15 +68,16 @@ class Way:
     begin_s: float = 0.0
     period_s: float = PERIOD_S
 
-    def from_first(self, pose: Pose) -> Float64[np.ndarray, "4 4"]:
+    def from_first(self, pose: Pose) -> Pose:
         """Return a pose in the frame of the first generated scan."""
-        return transform_between(pose, self.poses[0]).numpy()
+        return transform_between(pose, self.poses[0])
 
     def places(self) -> list[str]:
         """Return a hash of where and when each generated scan is made, beside the first one and those that are seen."""
         seen = [(self.from_first(one.pose), one.time_s - self.begin_s) for one in self.seen]
         made = [(self.from_first(pose), number * self.period_s) for number, pose in enumerate(self.poses)]
-        words = [[round(float(each), _DIGITS) + 0.0 for each in (*pose.flat, at_s)] for pose, at_s in (*seen, *made)]
+        numbers = [(*pose.flatten().tolist(), at_s) for pose, at_s in (*seen, *made)]
+        words = [[round(each, _DIGITS) + 0.0 for each in some] for some in numbers]
         before, own = words[: len(seen)], words[len(seen) :]
         return [sha256_of_json([before, each])[:12] for each in own]
 
@@ -185,14 +185,16 @@ def write_drives(
         for frame, place in enumerate(way.places())
     ]
     identity = {"source": str(run_folder), **facts, **sampling_identity(generator, run_folder, settings)}
-    folder = ScanFolder(out, MANIFEST, identity, KittiTree(out).files(names), identities)
+    tree = KittiTree(out)
+    files = tree.files(names)
+    folder = ScanFolder(out, MANIFEST, identity, files, identities)
     with folder.writing("sampling") as progress:
         folder.tell_sensor(generator.sensor)
         for drive, (way, seed) in enumerate(zip(ways, seeds, strict=True)):
+            own = [file for file in files if file.startswith(f"sequences/{drive:02d}/")]
+            places = map(way.from_first, way.poses)
+            tree.write_motions(own, [Motion(number * way.period_s, pose) for number, pose in enumerate(places)])
             sequence = out / "sequences" / f"{drive:02d}"
-            if sum(1 for _ in sequence.glob("velodyne/*.bin")) <= len(way.poses):  # else rows of more scans are there
-                moved = [way.from_first(pose) for pose in way.poses]
-                write_motions(out, f"{drive:02d}", moved, [number * way.period_s for number in range(len(moved))])
             _Drive(generator, opening, way, seed, sequence, settings).write(progress)
     return folder.num_written
 
