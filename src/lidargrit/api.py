@@ -32,7 +32,7 @@ from lidargrit.scans.projection import project as project_scan
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.projection.image import ProjectionVariant
 from lidargrit.scans.projection.inspection import Inspection
-from lidargrit.scans.sensors import ProjectionName, SensorModel, load_sensor
+from lidargrit.scans.sensors import ProjectionName, Sensor, SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.simulator import simulate
 from lidargrit.systems.segmenter.system import Segmenter
@@ -60,8 +60,6 @@ Points: TypeAlias = Scan | np.ndarray | Tensor
 """A scan, or coordinates of its points in metres as an array (n, 3), or (n, 4) with intensity."""
 Scans: TypeAlias = str | Path | Sequence[Points] | RangeImage
 """A source of scans by its name or folder, scans in memory, or a batch of range images (B, H, W)."""
-Sensor: TypeAlias = SensorModel | str | Path
-"""A sensor, its name, or its ``.json`` file."""
 _packaged_model, _packaged_segmenter = lru_cache(open_model), lru_cache(open_segmenter)  # each is read once
 
 

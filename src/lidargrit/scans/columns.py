@@ -73,7 +73,7 @@ def parts_of_columns(
     points_xyz_m = torch.stack([floats(named[axis]) for axis in "xyz"], dim=1)
     _refuse_lost_digits([named[axis] for axis in "xyz"], points_xyz_m, source)
     ring, label = (_first(named, names) for names in (_RING, _LABEL))
-    good = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    good = _are_returns(points_xyz_m)
     ring = None if ring is None else _whole(ring, good, _RING_AT_MOST, "ring", source)
     if ring is not None and _tells_rows(ring, points_xyz_m, good):
         _refuse_counts_from_1(ring[good], source)
@@ -126,13 +126,17 @@ def treated_parts(parts: ScanParts, bad_points: BadPoints) -> ScanParts:
     if bad_points == "refuse":
         return parts
     points_xyz_m, reflectance = parts["points_xyz_m"], parts.get("reflectance")
-    kept = points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
+    kept = _are_returns(points_xyz_m)
     if reflectance is not None:
         kept &= ~reflectance.isnan()
     if bool(kept.all()):
         return parts
     told = f"{int((~kept).sum()):,} of {len(kept):,} points left out: NaN, infinite or at the origin"
     return {**parts, **selected(parts, kept), "notes": (*parts.get("notes", ()), told)}
+
+
+def _are_returns(points_xyz_m: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    return points_xyz_m.isfinite().all(dim=1) & (points_xyz_m != 0).any(dim=1)
 
 
 def selected(parts: ScanParts, which: Tensor) -> ScanParts:

@@ -4,7 +4,6 @@ import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -12,7 +11,7 @@ from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import FRAMES_AT_MOST
-from lidargrit.scans.sensors import SensorModel, load_sensor
+from lidargrit.scans.sensors import Sensor, SensorModel, load_sensor
 from lidargrit.scans.types import Scan
 from lidargrit.simulator.beams import REVOLUTION_S
 from lidargrit.simulator.observation import Observation, ObservationConfig, observe_scene
@@ -33,7 +32,7 @@ _DEFAULT = "hdl64e_kitti_odometry"
 
 def simulate(
     seed: int,
-    sensor: SensorModel | str | Path | None = None,
+    sensor: Sensor | None = None,
     *,
     theme: Theme = "mixed",
     frame: int = 0,
@@ -95,7 +94,7 @@ def simulate(
 
 def observe(
     seed: int,
-    sensor: SensorModel | str | Path | None = None,
+    sensor: Sensor | None = None,
     *,
     theme: Theme = "mixed",
     frame: int = 0,

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import torch
 from jaxtyping import Float
@@ -186,7 +186,11 @@ def _setup_of(data: Any) -> SensorSetup:
         raise ConfigError(got, wanted, "correct the set-up, or leave it out") from None
 
 
-def load_sensor(name: str | Path | SensorModel) -> SensorModel:
+Sensor: TypeAlias = SensorModel | str | Path
+"""A sensor, its name, or its ``.json`` file."""
+
+
+def load_sensor(name: Sensor) -> SensorModel:
     """Return a sensor by its name ("hdl64e_kitti_360", ...), from a ``.json`` file, or the drawn one of a seed
     ("drawn_7"); a sensor as it is.
 
