@@ -107,8 +107,9 @@ def test_commands_are_such_as_the_program_takes(page):
         assert not refused or refused.startswith("got no "), command  # a sentence may name a verb alone
 
 
-def test_programs_that_pages_tell_to_run_are_there():
-    for page, text in TEXTS.items():
+def test_programs_that_pages_and_docstrings_name_are_there():
+    sources = [path for folder in ("src", "benchmarks", "examples") for path in (ROOT / folder).rglob("*.py")]
+    for page, text in (TEXTS | {path: path.read_text(encoding="utf-8") for path in sources}).items():
         for path in re.findall(r"\b((?:benchmarks|examples)/\w+\.py)", text):
             assert (ROOT / path).is_file(), f"{page.name}: {path}"
 
