@@ -88,6 +88,17 @@ def test_an_archive_that_cannot_be_is_refused(tmp_path, names, others):
         Archive(path).check()
 
 
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_header_packed_so_that_it_would_unpack_to_any_size_is_refused(tmp_path, method):
+    """Of these methods Python unpacks all at once: 5 kB that claim 60 MB took 12 GB."""
+    path, whole = tmp_path / "scans.lgz", archive_of(["a"], {"0": b"hello"})
+    with zipfile.ZipFile(io.BytesIO(whole)) as good, zipfile.ZipFile(path, "w") as archive:
+        for name in good.namelist():
+            archive.writestr(name, good.read(name), method if name == "header.json" else zipfile.ZIP_STORED)
+    with pytest.raises(ScanError, match="cut off or altered"):
+        Archive(path)
+
+
 def test_a_scan_that_claims_to_be_larger_than_the_file_is_refused_before_it_is_read(tmp_path):
     path, right = tmp_path / "scans.lgz", archive_of(["a"], {"0": b"hello, scan"})
     sizes = struct.pack("<II", 11, 11)  # packed and unpacked, beside the scan and in the directory

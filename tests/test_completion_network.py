@@ -181,7 +181,10 @@ def test_a_bundle_completes_each_scan_by_the_run_for_what_is_known_of_it(tmp_pat
     assert locate(tmp_path, "raydrop") == locate(tmp_path) == tmp_path / "lidargrit"
 
 
-@pytest.mark.parametrize("runs", ['{"complete": "completion"}', '{"sample": "../x"}', '{"sample": 3}', "[]", "{"])
+@pytest.mark.parametrize(
+    "runs",
+    ['{"complete": "completion"}', '{"sample": "../x"}', '{"sample": 3}', '{"sample": ["lidargrit"]}', "[]", "{"],
+)
 def test_a_bundle_that_names_no_run_that_samples_or_one_elsewhere_is_refused(tmp_path, runs):
     save_bundle(tmp_path, SENSOR, TINY)
     (tmp_path / "bundle.json").write_text(runs)

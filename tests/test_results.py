@@ -2,12 +2,13 @@
 
 import argparse
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lidargrit.cli import _results, main
-from lidargrit.core.errors import OutputError
+from lidargrit.core.errors import DataError, OutputError
 from lidargrit.core.files import write_json
 from lidargrit.core.table import render
 from lidargrit.evaluation.intervals import Score, around
@@ -48,6 +49,13 @@ def test_the_file_is_written_though_nobody_reads_the_table(monkeypatch, tmp_path
     with pytest.raises(BrokenPipeError):
         _results.print_result(options, "table", {"a": 1})
     assert json.loads(options.json.read_text()) == {"a": 1}
+
+
+def test_departures_that_are_no_sentences_are_refused_in_one_line(tmp_path):
+    for departures in (3, [3], "a sentence"):
+        write_json(tmp_path / "theirs.json", replace(card(score(0.5)), about={"departures": departures}).to_json())
+        with pytest.raises(DataError, match=r"theirs\.json, which cannot be used"):
+            side_by_side([tmp_path / "theirs.json"])
 
 
 def test_a_foreign_name_reaches_no_terminal_as_code(tmp_path):

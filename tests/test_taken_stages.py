@@ -1,12 +1,13 @@
 """Stages that a preset takes from another run: as they are, trained further, or not at all."""
 
+import json
 from dataclasses import replace
 
 import pytest
 import torch
 
 from lidargrit.core.configuration import changed, override
-from lidargrit.core.errors import ConfigError
+from lidargrit.core.errors import CheckpointError, ConfigError
 from lidargrit.core.files import read_tensors
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.generator import load, load_class
@@ -16,7 +17,7 @@ from lidargrit.systems.lidargrit.system import TokenSampling
 from lidargrit.systems.maskgit.system import MaskGitConfig
 from lidargrit.training import plan_training, train
 from lidargrit.training.plan import check_stages
-from lidargrit.training.taken_stages import taken_stages
+from lidargrit.training.taken_stages import taken_facts, taken_stages
 from test_pixel_stage import PIXELS, SENSOR, TOKENIZER, TRANSFORMER, made, preset_of
 
 ALL = ("tokenizer", "transformer", "pixels")
@@ -298,6 +299,16 @@ def test_one_reflow_is_distilled_to_several_numbers_of_steps(tmp_path):
     assert check_stages(preset).frozen.keys() == {"flow", "reflow"}
     with pytest.raises(ConfigError, match=r"whose distillation is another \(model\.reflow\.distilled_steps=4\)"):
         check_stages(load_preset("r2flow_small_reflow", taken))
+
+
+@pytest.mark.parametrize(
+    "about",
+    [{"preset": "x"}, {"preset": {"data": 3}}, {"preset": {"data": {"train": None}}}, {"files": 3}, {"taken": [1]}],
+)
+def test_a_donor_whose_facts_have_another_shape_is_told_in_one_line(about, tmp_path):
+    (tmp_path / "run.json").write_text(json.dumps(about))
+    with pytest.raises(CheckpointError, match=r"run\.json, which cannot be used .*; restore the file"):
+        taken_facts(starting(preset_of(None), tmp_path, ALL[:1]))
 
 
 def test_runs_that_are_no_donors(tmp_path):

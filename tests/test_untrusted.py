@@ -38,7 +38,8 @@ from lidargrit.nn.devices import usable_device
         ('{"a": NaN}', "NaN, which is not JSON"),
         ('{"a": -Infinity}', "-Infinity, which is not JSON"),
         ('{"a": 1e400}', "1e400, which no float can hold"),
-        ('{"a": ' + "9" * 5000 + "}", "cannot be used"),
+        ('{"a": ' + "9" * 5000 + "}", "9, which no float can hold"),
+        ('{"a": [-' + "9" * 400 + "]}", "9, which no float can hold"),  # was a traceback where a table showed it
         ("null", "null in place of an object"),
         ("[]", "a list in place of an object"),
         ('"a', "cannot be used"),

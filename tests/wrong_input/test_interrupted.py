@@ -82,6 +82,24 @@ def test_only_verbs_that_keep_their_work_say_that_they_go_on(words, follows, mon
     assert capsys.readouterr().err == f"\nlidargrit {words[0]}: interrupted; {follows}\n"
 
 
+def test_an_interrupted_report_says_what_the_scores_that_are_there_take(tmp_path, monkeypatch, capsys):
+    """The same command without --overwrite is refused."""
+    scores = tmp_path / "scores.json"
+
+    def interrupted(_):
+        scores.write_text("{}")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidargrit.cli.evaluate.run", interrupted)
+    words = ["evaluate", "one", "other", "--json", str(scores), "--report", str(tmp_path / "page.html")]
+    for more, follows in (
+        ([], f"{scores} is there, and the same command with --overwrite begins anew"),
+        (["--overwrite"], "the same command begins anew"),
+    ):
+        assert main([*words, *more]) == 130
+        assert capsys.readouterr().err == f"\nlidargrit evaluate: interrupted; {follows}\n"
+
+
 def hidden(folder: Path) -> list[Path]:
     return [path for path in folder.rglob(".*") if path.is_file()]
 

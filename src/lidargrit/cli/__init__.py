@@ -93,6 +93,8 @@ def _write_nowhere() -> None:
 
 def _what_follows(options: argparse.Namespace) -> str:
     """Say what the same command does when it is run again after an interruption."""
+    if (file := vars(options).get("json")) and file.is_file() and not options.overwrite:  # and its report is not
+        return f"{file} is there, and the same command with --overwrite begins anew"
     return "the same command goes on" if options.goes_on else "the same command begins anew"
 
 

@@ -101,19 +101,24 @@ def read_member(
     bytes_at_most: int = ARRAY_BYTES_AT_MOST,
     may_have_fields: bool = False,
 ) -> np.ndarray:
-    """Unpack one array of an archive.
+    """Unpack one array of an archive; what is raised is as of :func:`unpacked`."""
+    return parse_array(unpacked(archive, info, bytes_at_most), may_have_fields)
+
+
+def unpacked(archive: zipfile.ZipFile, info: zipfile.ZipInfo, bytes_at_most: int) -> bytes:
+    """Return the bytes of one file of an archive.
 
     Raises:
         ValueError: it says that it is larger, is packed by another method than numpy's, or is damaged.
     """
+    # Of other methods Python unpacks all that it has read at once, which may be a thousand times as much.
     if info.file_size > bytes_at_most or info.compress_type not in _PACKED:
         raise ValueError(f"{info.file_size:,} bytes in one array, packed by method {info.compress_type}")
     try:
         with archive.open(info) as file:
-            data = file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
+            return file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
     except Exception as error:  # a damaged archive is met with errors of many kinds
         raise ValueError(f"a damaged array ({first_words(error)})") from None
-    return parse_array(data, may_have_fields)
 
 
 def mapped_member(path: Path, name: str) -> np.ndarray:

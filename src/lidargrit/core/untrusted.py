@@ -58,7 +58,7 @@ def parse_json(
     try:
         if len(data) > at_most:
             raise ValueError(f"more than {at_most:,} bytes")
-        value = json.loads(data, parse_constant=_refuse_constant, parse_float=_finite)
+        value = json.loads(data, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_whole)
         if _is_deep(value):
             raise RecursionError
         if not isinstance(value, kind):
@@ -188,6 +188,11 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text[:40]}, which no float can hold")
     return value
+
+
+def _whole(text: str) -> int:
+    _finite(text)
+    return int(text)
 
 
 def _is_deep(value: Any) -> bool:

@@ -61,7 +61,7 @@ def _runs_of(bundle: Path) -> dict[str, str]:
         got, wanted = f"{bundle / BUNDLE_FILE} without a run that samples, or with an unknown job", str(get_args(Job))
         raise CheckpointError(got, f"folders by their jobs, {wanted}", "restore the file")
     for run in runs.values():
-        if run not in names:
+        if not isinstance(run, str) or run not in names:
             got = f"{bundle / BUNDLE_FILE}, which names {str(run)[:40]!r}"
             raise CheckpointError(got, "folders that lie beside it", "restore the folder")
     return runs
@@ -99,15 +99,9 @@ def read_config(folder: Path) -> SavedConfig:
         )
     path = folder / CONFIG_FILE
     about = read_json(path)
-    with told_of(path):
-        try:
-            config, sensor, generator = about["config"], SensorModel.from_json(about["sensor"]), about["generator"]
-            return SavedConfig(str(generator), config, sensor)
-        except LidarGritError:
-            raise
-        except (KeyError, TypeError, ValueError) as error:  # the last from tables that are not rectangular
-            got = f"{path}, which cannot be used ({error})"
-            raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
+    with told_of(path), shaped_as_ours(path):
+        config, sensor, generator = about["config"], SensorModel.from_json(about["sensor"]), about["generator"]
+        return SavedConfig(str(generator), config, sensor)
 
 
 def takes_any_sensor(folder: Path) -> bool:
@@ -125,6 +119,18 @@ def told_of(path: Path) -> Iterator[None]:
         names_it = str(path) in error.got
         got = error.got if names_it else f"{path}, in which stands {error.got}"
         raise CheckpointError(got, error.wanted, error.cure if names_it else "restore the file") from None
+
+
+@contextmanager
+def shaped_as_ours(path: Path) -> Iterator[None]:
+    """Turn what the ``with`` block meets in JSON of another shape than ours into a CheckpointError with its file."""
+    try:
+        yield
+    except LidarGritError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        got = f"{path}, which cannot be used ({error!r})"
+        raise CheckpointError(got, "what lidargrit wrote", "restore the file") from None
 
 
 def weights_sha256(folder: Path) -> str:

@@ -212,7 +212,8 @@ def begun_by(manifest: Path, difference: Callable[[dict[str, Any]], str]) -> dic
 
 def check_names(source: str, names: Sequence[str]) -> None:
     """Raise DataError if several scans of a source would be one file: the last would replace others."""
-    if twice := sorted(name for name, count in Counter(names).items() if count > 1):
+    alike = Counter(str(PurePosixPath(name)) for name in names)  # "a" and "./a" are one file
+    if twice := sorted(name for name, count in alike.items() if count > 1):
         got = f"several scans of {source} that would be {twice[0]}"
         raise DataError(got, "a name for each scan, as each becomes a file", "rename some, or take their folders apart")
 

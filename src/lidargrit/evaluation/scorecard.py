@@ -150,6 +150,7 @@ class Scorecard:
     def from_json(cls, data: dict[str, Any]) -> "Scorecard":
         """Return what :meth:`to_json` made plain values of; other values raise one of Python's own errors."""
         hints, protocol = hints_of(cls), dict(data["protocol"])
+        rebuilt(tuple[str, ...], protocol.get("departures", []), "departures")  # refuses what is no list of sentences
         return cls(
             str(protocol.pop("name")),
             protocol,

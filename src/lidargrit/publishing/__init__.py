@@ -9,13 +9,14 @@ from typing import Any
 import torch
 
 from lidargrit.core import configuration
-from lidargrit.core.errors import CheckpointError, ConfigError, OutputError
+from lidargrit.core.errors import ConfigError, OutputError
 from lidargrit.core.files import claim_folder, is_taken, read_json, sha256_of, write_json
 from lidargrit.core.version import __version__
 from lidargrit.data.run_folder import (
     CARD_FILE,
     RUN_FILE,
     locate,
+    shaped_as_ours,
     taken_over,
     trained_on,
     weights_sha256,
@@ -96,12 +97,8 @@ def publish(
                 f"publish with --bits {bits} alone, score that, and publish it with its scores",
             )
     learned = trained_on(run)
-    try:
+    with shaped_as_ours(run / RUN_FILE):
         card, public = model_card(generator, about, learned, card_scores, bits), _public_facts(about, generator)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(
-            f"{run / RUN_FILE}, which cannot be used ({error!r})", "what lidargrit wrote", "restore the file"
-        ) from None
     card = "\n".join(filter(None, [card, notes.strip() and notes.strip() + "\n"]))
     with claim_folder(folder):
         _refuse_taken(folder, public)

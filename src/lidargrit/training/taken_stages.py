@@ -10,7 +10,15 @@ from torch import Tensor
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.files import read_json
-from lidargrit.data.run_folder import CHECKPOINT_FILE, RUN_FILE, is_run, locate, named_folder, taken_over
+from lidargrit.data.run_folder import (
+    CHECKPOINT_FILE,
+    RUN_FILE,
+    is_run,
+    locate,
+    named_folder,
+    shaped_as_ours,
+    taken_over,
+)
 from lidargrit.generation.generator import Generator, load
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.settings import Preset
@@ -35,11 +43,12 @@ def taken_facts(preset: Preset) -> dict[str, Any]:
     for run in sorted({*preset.start_runs.values()}):
         path = locate(run) / RUN_FILE
         about = read_json(path) if path.is_file() else {}
-        theirs, before = about.get("preset") or {}, taken_over(about)
-        trained = {} if about.get("files") else {**theirs.get("training", {}), **before["training"]}
-        train |= {*theirs.get("data", {}).get("train", [_UNKNOWN_SCANS]), *before["train"]}
-        files += [*about.get("files", ()), *before["files"]]
-        training |= {stage: trained.get(stage) for stage, of in preset.frozen.items() if of == run}
+        with shaped_as_ours(path):
+            theirs, before = about.get("preset") or {}, taken_over(about)
+            trained = {} if about.get("files") else {**theirs.get("training", {}), **before["training"]}
+            train |= {*map(str, [*theirs.get("data", {}).get("train", [_UNKNOWN_SCANS]), *before["train"]])}
+            files += [*about.get("files", ()), *before["files"]]
+            training |= {stage: trained.get(stage) for stage, of in preset.frozen.items() if of == run}
     return {"train": sorted(train), "files": files, "training": training}
 
 

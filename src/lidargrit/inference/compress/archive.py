@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lidargrit.core.arrays import unpacked
 from lidargrit.core.errors import OutputError, ScanError
 from lidargrit.core.files import atomic_path, claim_folder, read_json, write_json
 from lidargrit.core.untrusted import JSON_BYTES_AT_MOST, parse_json
@@ -189,8 +190,10 @@ class Archive:
             size = os.fstat(file.fileno()).st_size
         with self._damage_told():
             self._archive = zipfile.ZipFile(path)
-            self.header = parse_json(self._json(_HEADER), str(path), dict, ScanError)
-            self.names = parse_json(self._json(_NAMES), str(path), list, ScanError)
+            files = map(self._archive.getinfo, (_HEADER, _NAMES))
+            header, names = (unpacked(self._archive, file, JSON_BYTES_AT_MOST) for file in files)
+            self.header = parse_json(header, str(path), dict, ScanError)
+            self.names = parse_json(names, str(path), list, ScanError)
             self._scans = [self._archive.getinfo(str(number)) for number in range(len(self.names))]
             # Stored as they are, scans of a file are no larger than it; two of one name would be one file.
             stored = all(scan.compress_type == zipfile.ZIP_STORED for scan in self._scans)
@@ -213,13 +216,6 @@ class Archive:
         """Read all scans, and refuse the file if one was altered."""
         for index in range(len(self)):
             self.read(index)
-
-    def _json(self, name: str) -> bytes:
-        info = self._archive.getinfo(name)
-        if info.file_size > JSON_BYTES_AT_MOST:
-            raise ValueError
-        with self._archive.open(info) as file:
-            return file.read(info.file_size)  # never more, whatever the packed bytes would unpack to
 
     @contextmanager
     def _damage_told(self) -> Iterator[None]:
