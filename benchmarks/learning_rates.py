@@ -1,6 +1,6 @@
 """Systems trained at several learning rates with equally many operations → scores on validation streets, side by side.
 
-    OMP_NUM_THREADS=1 python benchmarks/learning_rates.py OUT r2dm_small:steps=32 lidargrit_small_pixels --flops 3e12
+    OMP_NUM_THREADS=1 python benchmarks/learning_rates.py OUT r2dm_small:steps=32 lidargrit_fine_small --flops 3e12
 
 Every system gets the same search: the rates of all its stages times each factor, one training each, the same budget and
 seed, and as many samples against as many validation streets. Test streets are not touched, so that a rate may be chosen

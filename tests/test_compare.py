@@ -280,7 +280,7 @@ def test_counted_operations_are_those_of_a_step_that_is_computed(preset, stage):
     assert counted == pytest.approx(counter.get_total_flops() / 2, rel=1e-6)
 
 
-SMALL = "ultralidar_small lidargen_small r2flow_small maskgit_small lidm_small lidargrit_small_pixels lidarvae_small"
+SMALL = "ultralidar_small lidargen_small r2flow_small maskgit_small lidm_small lidargrit_fine_small lidarvae_small"
 
 
 @pytest.mark.parametrize("preset", [*SMALL.split(), "dusty_kitti_odometry", "lidargrit_fine_wide"])

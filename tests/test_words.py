@@ -164,7 +164,7 @@ def test_bash_completes(capsys, tmp_path):
     for words, offered in (
         ("tra", "train"),
         ("list met", "metrics"),
-        ("train lidargrit_small_p", "lidargrit_small_pixels"),
+        ("train lidargrit_fine_s", "lidargrit_fine_small"),
         ("train --dr", "--dry-run"),
     ):
         typed = (

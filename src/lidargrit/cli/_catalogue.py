@@ -7,7 +7,7 @@ from lidargrit.core import discovery
 
 KINDS = tuple(kind for kind in discovery.FOLDERS if kind != "cli")
 """Each kind as a user types it."""
-_FIRST = ("lidargrit_small_pixels", "lidargrit_wide_pixels", "multiscale_small", "lidargrit_demo")
+_FIRST = ("lidargrit_fine_small", "lidargrit_wide_pixels", "multiscale_small", "lidargrit_demo")
 _GROUPS = ("to begin with: your own scans, 64x1024, to compress, a check for minutes", "others", "to compare with")
 
 

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 from lidargrit.generation import presets as shared
-from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
 from lidargrit.generation.presets import preset, variant
 from lidargrit.generation.settings import TrainingConfig
 from lidargrit.generation.tokenizers.nearest_range import NearestRangeConfig
@@ -143,6 +142,12 @@ _COMPACT_PIXELS = variant(
         "training.pixels": shared.PIXELS,
     },
 )
+_OF_FINE_CELLS = TransformerConfig(
+    heads=4, embedding_dropout=0.0, neighbours=True, code_features=True, window_columns=32
+)
+_BESIDE_FINE_CELLS = replace(
+    shared.PIXEL_DECODER, coarsest_cell=16, mask_features=6, decoded_components=True, weighed_components=True
+)
 _FOR_A_DEMO = {
     "data.train": ("simulated:256:train",),
     "data.val": shared.DEMO_STREETS.val,
@@ -170,19 +175,6 @@ PRESETS = {
     "lidargrit_small": _SMALL,
     "lidargrit_compact": _COMPACT,
     "lidargrit_compact_pixels": _COMPACT_PIXELS,
-    "lidargrit_small_pixels": variant(
-        "LidarGRIT with a pixel decoder, small: 64x256 in 256 tokens, for one CPU core and four hours",
-        _SMALL,
-        {
-            # Fewer tokens are learned sooner, and the pixel decoder adds the detail that they leave out.
-            "model.tokenizer.channel_multipliers": (1, 1, 2, 4),
-            **_NO_DROPOUT,  # which costs likelihood in so short a training, see docs/decisions/0020
-            # Columns are 1.4 degrees apart and rows 0.4, so rows come closer last.
-            "model.pixels": PixelDecoderConfig(16, row_halvings=2, surface_components=True, gravity_components=True),
-            "training.transformer": replace(_BY_MUON, scans=40_000),
-            "training.pixels": replace(shared.PIXELS, scans=20_000),
-        },
-    ),
     "lidargrit_wide_pixels": variant(
         "LidarGRIT with a pixel decoder: 64x1024 in 1,024 tokens, for one CPU core and five hours",
         _COMPACT_PIXELS,
@@ -208,27 +200,28 @@ PRESETS = {
             ),
         },
     ),
+    "lidargrit_fine_small": preset(
+        "LidarGRIT with a pixel decoder: 64x256 in 1,024 tokens of nearest ranges, for one CPU core and four hours",
+        shared.MORE_STREETS,
+        LidarGritConfig(
+            NearestRangeConfig(),
+            replace(_OF_FINE_CELLS, layers=4, width=160, windows_per_scan=2),
+            replace(_BESIDE_FINE_CELLS, row_halvings=2),  # columns are 1.4 degrees apart and rows 0.4
+        ),
+        tokenizer=replace(shared.SMALL_STAGES["tokenizer"], scans=8000, augmentations=()),
+        transformer=replace(_BY_MUON, scans=40_000, weight_decay=0.0, augmentations=()),
+        pixels=replace(shared.PIXELS, scans=20_000, optimiser="muon"),
+    ),
     "lidargrit_fine_wide": preset(
         "LidarGRIT with a pixel decoder: 64x1024 in 4,096 tokens of nearest ranges, for half an hour of a GPU",
         replace(shared.WIDE_STREETS, train=("simulated:70000:train",), workers=16),
         LidarGritConfig(
-            NearestRangeConfig(cell_rows=4, cell_columns=4, part_rows=2, part_columns=2),
-            TransformerConfig(
-                heads=4,
-                embedding_dropout=0.0,
-                neighbours=True,
-                code_features=True,
-                window_columns=32,
-                windows_per_scan=4,
-            ),
+            NearestRangeConfig(cell_rows=4, cell_columns=4),
+            replace(_OF_FINE_CELLS, windows_per_scan=4),
             replace(
-                shared.PIXEL_DECODER,
-                coarsest_cell=16,
+                _BESIDE_FINE_CELLS,
                 column_halvings=2,  # columns are closer than rows
-                mask_features=6,
                 coarse_range_width=48,
-                decoded_components=True,
-                weighed_components=True,
                 range_temperature=0.2,  # for pixels that learn beside true neighbours last
             ),
         ),
