@@ -146,7 +146,12 @@ _OF_FINE_CELLS = TransformerConfig(
     heads=4, embedding_dropout=0.0, neighbours=True, code_features=True, window_columns=32
 )
 _BESIDE_FINE_CELLS = replace(
-    shared.PIXEL_DECODER, coarsest_cell=16, mask_features=6, decoded_components=True, weighed_components=True
+    shared.PIXEL_DECODER,
+    coarsest_cell=16,
+    mask_features=6,
+    decoded_components=True,
+    weighed_components=True,
+    range_temperature=0.2,  # for pixels that learn beside true neighbours last
 )
 _FOR_A_DEMO = {
     "data.train": ("simulated:256:train",),
@@ -218,12 +223,7 @@ PRESETS = {
         LidarGritConfig(
             NearestRangeConfig(cell_rows=4, cell_columns=4),
             replace(_OF_FINE_CELLS, windows_per_scan=4),
-            replace(
-                _BESIDE_FINE_CELLS,
-                column_halvings=2,  # columns are closer than rows
-                coarse_range_width=48,
-                range_temperature=0.2,  # for pixels that learn beside true neighbours last
-            ),
+            replace(_BESIDE_FINE_CELLS, column_halvings=2, coarse_range_width=48),  # columns are closer than rows
         ),
         tokenizer=replace(_RELAYED, scans=10_000, learning_rate=2e-3, augmentations=("flip",)),
         transformer=replace(_RELAYED, scans=100_000, optimiser="muon", learning_rate=3e-3),
