@@ -16,7 +16,7 @@ import torch
 
 from lidargrit.core import reporting
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.sources import load_range_images
+from lidargrit.data.sources import open_source
 from lidargrit.generation.generator import load
 from lidargrit.generation.tokens import DecodingOfTokens, TokenGenerator
 from lidargrit.scans.types import RangeImage
@@ -34,13 +34,11 @@ def main() -> None:
     generator = load(options.run)
     assert isinstance(generator, TokenGenerator), "a run that samples no tokens"
     sampling = generator.parse_sampling(options.set)
-    data = DataConfig(train=(options.scans,))
-    images = load_range_images(data.train, data, generator.sensor)
-    count = min(options.n, len(images))
+    images = open_source(options.scans).images(generator.sensor, DataConfig(max_scans=options.n))
     options.out.mkdir(parents=True)
     (options.out / "sensor.json").write_text(json.dumps(generator.sensor.to_json()))
-    with reporting.progress("drawing", count) as progress:
-        for index in range(count):
+    with reporting.progress("drawing", len(images)) as progress:
+        for index in range(len(images)):
             drawn = draw(generator, images.batch([index]), sampling, seed=index)
             np.save(options.out / f"{index:06d}.npy", torch.where(drawn.return_mask, drawn.range_m, 0.0)[0].numpy())
             progress.advance(1)
