@@ -1,5 +1,6 @@
 """Files that appear whole or not at all: killed writers, several writers, folders that a command holds."""
 
+import errno
 import fcntl
 import os
 import shutil
@@ -208,6 +209,13 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path):
         raise KeyError
     assert everything_in(tmp_path) == ["a.txt"]
     assert (tmp_path / "a.txt").read_text() == "old"
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "full"), KeyboardInterrupt()])
+def test_a_failed_write_leaves_no_folder_that_was_made_for_it(tmp_path, error):
+    with pytest.raises((OutputError, KeyboardInterrupt)), atomic_path(tmp_path / "new" / "a.bin"):
+        raise error
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_folder_that_is_removed_meanwhile_ends_the_write_in_one_line(tmp_path):

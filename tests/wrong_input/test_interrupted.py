@@ -224,6 +224,15 @@ def test_a_full_disk_before_the_first_step_and_while_projecting(tmp_path, monkey
     assert main(train_words(tmp_path / "run")) == 0
 
 
+def test_a_full_disk_where_a_preparation_begins_leaves_nothing(tmp_path, capsys):
+    for size, wanted in ((0, "scans.json"), (1000, "plan.json")):
+        with files_limited_to(size):
+            assert main(["prepare", "simulated:1", "-o", str(tmp_path / "out")]) == 2
+        assert re.search(rf"got '.*' while writing .*{wanted}; ", the_one_line(capsys.readouterr().err, "prepare"))
+        assert contents(tmp_path) == {}
+        assert not (tmp_path / "out").exists()
+
+
 def test_a_full_disk_while_logging(tmp_path, interrupt, capsys):
     words = train_words(tmp_path / "run", *LONG)
     assert interrupt(4, words) == 130

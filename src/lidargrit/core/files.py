@@ -40,6 +40,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         OutputError: the disk is full or the folder cannot be written to; what stood at ``path`` still stands.
     """
+    is_new = not os.path.exists(path.parent)  # False of a path that cannot be
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with _partial_file(path.parent) as temporary:
@@ -53,6 +54,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
             "a folder with room that may be written to",
             "free some space or choose another folder; nothing that was there is lost",
         ) from error
+    finally:
+        if is_new:
+            with suppress(OSError):  # it holds the file, as it should
+                path.parent.rmdir()
 
 
 @contextmanager

@@ -13,7 +13,15 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.environment import cache_folder
 from lidargrit.core.errors import DataError, OutputError, counted_scans, no_usable_scan
-from lidargrit.core.files import claim_folder, is_taken, sha256_of_json, state_of, write_json, write_text
+from lidargrit.core.files import (
+    claim_folder,
+    claimed_manifest,
+    is_taken,
+    sha256_of_json,
+    state_of,
+    write_json,
+    write_text,
+)
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
 from lidargrit.data.datasets import ScanDataset, open_dataset
@@ -245,8 +253,9 @@ def _claim(folder: Path, spec: PreparedSpec, scans: list[tuple[Any, ...]]) -> No
     # In this order: another process may be claiming the folder for the same scans at this moment.
     if is_taken(folder) and not (path.is_file() and path.read_bytes() == listing.encode()):
         raise OutputError(f"{folder}, which holds something else", "an empty folder", "choose another one")
-    write_text(path, listing)
-    write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
+    with claim_folder(folder, shared=True), claimed_manifest(path):  # on a full disk neither is left
+        write_text(path, listing)
+        write_json(folder / PLAN_FILE, asdict(spec))  # last: it says that the folder is ours
 
 
 def _sweep(folder: Path) -> None:
