@@ -191,6 +191,24 @@ def test_a_pipe_in_a_prepared_folder_does_not_hang(folder, name):
         PreparedImages(str(folder))
 
 
+@pytest.mark.parametrize("name", [RANGES, "images.zarr/range/zarr.json"])
+def test_a_pipe_among_the_pixels_does_not_hang(folder, name):
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    arrays, wanted = ImageArrays(str(folder), PreparedImages(str(folder)).spec), np.zeros((1, 64, 4096), np.uint16)
+    for use in (lambda: pixels_of(folder), lambda: arrays.write(0, {"range": wanted})):
+        with pytest.raises(DataError, match=f"^got {folder / name}, a named pipe; wanted what lidargrit prepare wrote"):
+            use()
+
+
+def test_a_sensor_that_is_none_is_told_with_its_file(folder):
+    plan = json.loads((folder / "plan.json").read_text())
+    plan["sensor"]["range_max_m"] = -1
+    (folder / "plan.json").write_text(json.dumps(plan))
+    with pytest.raises(DataError, match=r"plan\.json, in which stands range limits .* to -1 m"):
+        PreparedImages(str(folder))
+
+
 def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
     tree = tmp_path / "tree"
     KittiOdometry.write_example(tree, 5)

@@ -1,6 +1,7 @@
 """Samples of other programs: told apart, turned into metres, and never trusted."""
 
 import contextlib
+import os
 import pickle
 import warnings
 import zipfile
@@ -110,6 +111,9 @@ def test_the_archive_of_r3dpa_is_read_scan_by_scan(tmp_path):
     (tmp_path / "img.npz").write_bytes((tmp_path / "img.npz").read_bytes()[:700_000])
     with pytest.raises(ScanError, match="which cannot be used"):
         read_tensor_folder(tmp_path, "r3dpa")
+    (tmp_path / "img.npz").unlink()
+    os.mkfifo(tmp_path / "img.npz")
+    assert not is_tensor_folder(tmp_path)
 
 
 @pytest.mark.parametrize(

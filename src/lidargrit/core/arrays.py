@@ -128,6 +128,8 @@ def mapped_member(path: Path, name: str) -> np.ndarray:
         ValueError: no such array, a packed or damaged one, or other numbers than floating-point ones.
     """
     try:
+        if not path.is_file():  # a pipe would hang
+            raise ValueError("no file")
         with zipfile.ZipFile(path) as archive, path.open("rb") as file:
             info = archive.getinfo(f"{name}.npy")
             if info.compress_type != zipfile.ZIP_STORED:

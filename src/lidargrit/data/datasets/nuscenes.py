@@ -194,6 +194,8 @@ def _poses(root: Path) -> dict[str, Float64[np.ndarray, "4 4"]]:
 
 
 def _rows(table: Path) -> Iterator[dict[str, Any]]:
+    if not table.is_file():  # a pipe would hang
+        raise OSError(f"no file {table.name}")
     with table.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         for row in _ROW.finditer(content):
             yield json.loads(row[0])

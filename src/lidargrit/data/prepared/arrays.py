@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,6 +78,8 @@ def store_errors(location: str) -> Iterator[None]:
     """Raise what the library tells of damage, or of a store out of reach, as DataError."""
     try:
         yield
+    except DataError:
+        raise
     except ValueError as error:
         if str(error).startswith(_DAMAGED):
             raise damaged(location, told(error)) from None
@@ -123,6 +126,8 @@ class ImageArrays:
         try:
             for name, pixels in planes.items():
                 self._array(name, create=True)[first : first + len(pixels)].write(pixels).result()
+        except DataError:
+            raise
         except ValueError as error:
             raise OSError(told(error)) from error
 
@@ -157,6 +162,8 @@ class ImageArrays:
 
         with self._lock:
             if name not in self._arrays:
+                if not self._is_far:
+                    _refuse_pipes(Path(self.location, name))
                 context = store_context(self._is_far)
                 opened = tensorstore.open(self._described(name), open=True, create=create, context=context)
                 self._arrays[name] = opened.result()
@@ -188,6 +195,13 @@ class ImageArrays:
                 "attributes": steps.get(name, {}),
             },
         }
+
+
+def _refuse_pipes(folder: Path) -> None:
+    """Refuse what the library would wait for without end."""
+    entries = [*os.scandir(folder)] if folder.is_dir() else []
+    if pipe := next((entry.path for entry in entries if not entry.is_file() and Path(entry).is_fifo()), None):
+        raise DataError(f"{pipe}, a named pipe", "what lidargrit prepare wrote", "remove it, and prepare again")
 
 
 def stored(image: RangeImage, step_m: float) -> dict[str, np.ndarray]:

@@ -178,7 +178,10 @@ class PreparedImages:
     def __init__(self, location: str) -> None:
         self._folder = PreparedFolder(location)
         self.spec = self._folder.read_spec()
-        self.sensor = SensorModel.from_json(self.spec.sensor)
+        try:
+            self.sensor = SensorModel.from_json(self.spec.sensor)
+        except ConfigError as error:
+            raise DataError(f"{location}/{PLAN_FILE}, in which stands {error.got}", error.wanted, _AGAIN) from None
         if self.spec.range_step_m != range_step_m(self.sensor):  # pixels are numbers of steps
             raise DataError(
                 f"{location}/{PLAN_FILE}, whose range_step_m is another than its sensor's",
