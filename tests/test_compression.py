@@ -173,6 +173,15 @@ def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp
     assert "which is not a file" in the_one_line(capsys.readouterr().err, "decompress")
 
 
+def test_rays_that_are_none_are_told_with_the_file(tmp_path, capsys):
+    path = tmp_path / "scans.lgz"
+    with writing(path, {"step_mm": 20, "model_sha256": "", "rays": {"name": "mine"}}) as writer:
+        add_scan(writer.folder, 0, ("one", "one", 1), b"a")
+    assert main(["decompress", str(path), str(tmp_path / "out")]) == 2
+    told = the_one_line(capsys.readouterr().err, "decompress")
+    assert f"{path}, in which stands a sensor without azimuth_rad, " in told
+
+
 def test_models_and_images_that_cannot_be_compressed_are_refused(codec):
     with pytest.raises(ConfigError, match="without a pixel decoder"):
         ScanCodec(made(None), 20)

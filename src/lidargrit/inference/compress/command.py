@@ -14,7 +14,7 @@ from lidargrit.core.errors import CheckpointError, ConfigError, DataError, ScanE
 from lidargrit.core.shares import each_done
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.run_folder import locate, projection_variant
+from lidargrit.data.run_folder import locate, projection_variant, told_of
 from lidargrit.data.scan_folder import IMAGE, ScanFolder, ScanIdentity, check_names, writable_format, write_array
 from lidargrit.data.sources.named import NamedScans
 from lidargrit.generation.generator import load
@@ -269,7 +269,9 @@ def _codec_of(archive: Archive, model: str) -> ScanCodec:
     if not (isinstance(step_mm, int) and isinstance(digest, str)):
         raise not_reproduced()
     rays = archive.header.get("rays")
-    codec = _codec(model, step_mm, None if rays is None else SensorModel.from_json(rays))
+    with told_of(archive.path):
+        sensor = None if rays is None else SensorModel.from_json(rays)
+    codec = _codec(model, step_mm, sensor)
     if codec.digest() != digest:
         archive_of = f"{archive.path}, compressed by the model {archive.header.get('model')!r} of hash {digest[:12]}"
         cure = f"name that run with --model: {model} has the hash {codec.digest()[:12]}"
