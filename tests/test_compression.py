@@ -160,6 +160,7 @@ def test_a_strangers_file_writes_only_files_that_can_be_and_below_its_folder(tmp
         (["x" * 300], "at most 255 bytes a name"),
         (["one", "one"], "was cut off or altered"),
         (["one", "./one"], "several scans of scans.lgz that would be one.npy"),  # the second replaced the first
+        (["a.npy/b", "a"], "a scan of scans.lgz that would be a.npy, which is also the folder of another"),
     ):
         path.unlink(missing_ok=True)
         with writing(path, {"step_mm": 20}) as writer:

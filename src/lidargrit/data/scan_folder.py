@@ -85,6 +85,10 @@ class ScanFolder:
             raise OutputError(f"{link}, which is a link", "a file of this command, or none", "remove the link")
         self.out, self.files, self._manifest = out, files, out / manifest
         of_files = dict(zip(files, identities, strict=True))
+        folders = {str(folder) for file in files for folder in PurePosixPath(file).parents}
+        if both := sorted(folders & of_files.keys()):
+            got = f"a scan of {facts['source']} that would be {both[0]}, which is also the folder of another"
+            raise DataError(got, "one name for each", "choose another --format, or rename some of the scans")
         self._facts = {**facts, "scans": {file: scan.name for file, scan in of_files.items()}}
         if states := {file: scan.state for file, scan in of_files.items() if scan.state}:
             self._facts["states"] = states
