@@ -131,9 +131,21 @@ def test_results_are_had_by_their_names_only(served):
     assert served.ask(f"{job}/0-1.ply")[0] == 200
     for name in ("0-2.ply", "1-0.ply", "0-0.pkl", "0-0.npz/..", "999-999.bin", "page.json", "../0-0.ply", "0--1.ply"):
         assert served.ask(f"{job}/{name}")[0] == 404
-    for method in ("PUT", "DELETE", "OPTIONS", "HEAD", "TRACE"):
+    for method in ("PUT", "DELETE", "OPTIONS", "TRACE"):
         assert served.ask("/models", method=method)[0] == 405
     assert served.refused("/models", {})[0] == 405
+
+
+@pytest.mark.parametrize(("path", "status"), [("/models", b"200 OK"), ("/nothing", b"404 Not Found")])
+def test_what_is_asked_for_its_head_has_no_body(served, path, status):
+    answers = [
+        served.say(f"{method} {path} HTTP/1.0\r\nHost: {served.host}\r\n\r\n".encode())[0] for method in ("HEAD", "GET")
+    ]
+    heads, bodies = zip(*(answer.split(b"\r\n\r\n", 1) for answer in answers), strict=True)
+    assert status in heads[0].splitlines()[0]
+    lengths = [re.findall(rb"Content-Length: (\d+)", head) for head in heads]
+    assert lengths[0] == lengths[1] == [str(len(bodies[1])).encode()]
+    assert bodies[0] == b""
 
 
 def test_labels_that_the_page_shows_are_saved(served, tmp_path):

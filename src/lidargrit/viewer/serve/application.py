@@ -115,7 +115,7 @@ class Application:
         if response.file_name:
             headers.append(("Content-Disposition", f'attachment; filename="{response.file_name}"'))
         start(response.status, headers)
-        return [response.body]
+        return [] if environment["REQUEST_METHOD"] == "HEAD" else [response.body]
 
     def _respond(self, environment: Environment) -> Response:
         host = environment.get("HTTP_HOST", "")
@@ -124,7 +124,7 @@ class Application:
             why = f"This page is not served under this name: open it {known}, or serve it with --host NAME."
             raise RefusedRequestError("403 Forbidden", why)
         method, path = environment["REQUEST_METHOD"], environment["PATH_INFO"]
-        if method == "GET":
+        if method in ("GET", "HEAD"):
             return self._get(path)
         if method != "POST" or path not in ("/generate", "/complete"):
             raise RefusedRequestError("405 Method Not Allowed", "Only GET, and POST to /generate or /complete.")
