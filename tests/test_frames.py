@@ -59,6 +59,21 @@ def test_other_units_are_told(factor):
             use()
 
 
+def test_numbers_that_are_no_coordinates_are_told():
+    scan = Scan(xyz_of(corner()) * 1e36)
+    for use in (lambda: project(scan, VLP16), lambda: fit_sensor([scan])):
+        with pytest.raises(ScanError, match=r"points at \de\+36 m in the median in a scan; .*; check of which type"):
+            use()
+
+
+def test_a_sensor_is_not_fitted_to_points_beyond_all_reach():
+    points = xyz_of(corner())
+    points[::100] *= 1e5
+    far = int((points.norm(dim=1) > 1000).sum())
+    with pytest.raises(ScanError, match=rf"got {far} points beyond 1,000 m; wanted .*; leave them out"):
+        fit_sensor([Scan(points)])
+
+
 def test_points_in_the_sensors_frame_are_not_doubted():
     scan = Scan(xyz_of(corner()) * 10)
     assert torch.isfinite(project(scan, VLP16).range_m).all()

@@ -22,7 +22,14 @@ from lidargrit.scans.projection.frame import told_height
 from lidargrit.scans.projection.pixel_coordinates import row_elevation_rad
 from lidargrit.scans.projection.revolutions import told_revolutions
 from lidargrit.scans.projection.sensor_check import closest_sensor
-from lidargrit.scans.sensors import NAME_AT_MOST, ProjectionName, SensorModel, column_azimuths_rad, load_sensor
+from lidargrit.scans.sensors import (
+    NAME_AT_MOST,
+    REACH_AT_MOST_M,
+    ProjectionName,
+    SensorModel,
+    column_azimuths_rad,
+    load_sensor,
+)
 from lidargrit.scans.types import Scan
 
 _SAME_AT_MOST = 0.25  # of the usual step between rows, in the mean: half of it would be the neighbours'
@@ -62,7 +69,11 @@ def farthest_m(range_m: Float64[np.ndarray, "n"]) -> float:
 
     Scans tell no near limit: other scans of the same sensor may have returns nearer than the nearest of these.
     """
-    return float(math.ceil(float(np.quantile(range_m, 0.9999))))
+    far_m = float(np.quantile(range_m, 0.9999))
+    if far_m > REACH_AT_MOST_M:
+        got = f"{(range_m > REACH_AT_MOST_M).sum():,} points beyond {REACH_AT_MOST_M:,} m"
+        raise ScanError(got, "the reach of a sensor, in metres", "leave them out of the files, or check the unit")
+    return float(math.ceil(far_m))
 
 
 def quantum_m(values_m: Float64[np.ndarray, "n"]) -> float | None:

@@ -9,6 +9,7 @@ from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
 
 _FAR_M = 500.0  # in the median: no turning sensor sees half of its points so far away
+_NO_LENGTH_M = 1e11  # in the median: ten times as far as any place of a map in millimetres from its origin
 _POINTS_MEASURED, _POINTS_AT_LEAST = 4096, 500
 _ROWS_AT_LEAST = 8  # fewer do not show a height
 _HEIGHTS_M = np.round(np.arange(-3.0, 3.01, 0.02), 2)  # of sensors on cars and robots, up and down
@@ -24,6 +25,9 @@ def other_frame(scan: Scan) -> ScanError | None:
     far_m = float(np.median(np.linalg.norm(points_m, axis=1)))
     if far_m < _FAR_M:
         return _camera_axes(points_m, scan.source)
+    if far_m > _NO_LENGTH_M:
+        what = f"points at {far_m:.0e} m in the median in {scan.source}"
+        return ScanError(what, "coordinates", "check of which type and in which order the file's numbers are")
     level_m = points_m[:, :2]
     centre_m = float(np.linalg.norm(np.median(level_m, axis=0)))
     spread_m = float(np.median(np.linalg.norm(level_m - np.median(level_m, axis=0), axis=1)))

@@ -26,7 +26,7 @@ from lidargrit.scans.sensors._checks import mean_azimuths_rad as mean_azimuths_r
 from lidargrit.scans.sensors._setup import SensorSetup as SensorSetup
 
 _DRAWN = "drawn_"
-_REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
+REACH_AT_MOST_M = 1000  # beyond, steps in which ranges are kept are coarser than 16 mm
 
 ProjectionName = Literal["spherical", "unfolding"]
 ProjectionOption = Literal["sensor", ProjectionName]  # the first: as the sensor has them
@@ -77,10 +77,10 @@ class SensorModel:
         tables = self.elevation_rad, self.azimuth_rad, self.azimuth_offset_rad
         check_tables(self.name, *tables, self.column_stride, self.first_edge_rad)
         check_projection(self.name, self.projection, get_args(ProjectionName))
-        if not 0 < self.range_min_m < self.range_max_m <= _REACH_AT_MOST_M:
+        if not 0 < self.range_min_m < self.range_max_m <= REACH_AT_MOST_M:
             raise ConfigError(
                 f"range limits {self.range_min_m:g} to {self.range_max_m:g} m for the sensor {self.name!r}",
-                f"0 < range_min_m < range_max_m <= {_REACH_AT_MOST_M:,} m",
+                f"0 < range_min_m < range_max_m <= {REACH_AT_MOST_M:,} m",
                 "correct the sensor's limits; if scans are in millimetres, divide them by 1000",
             )
 
