@@ -1,11 +1,14 @@
 """A comparison that is begun again: scores of weights that came since, the same seeds, and which limit held."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
+from lidargrit.core.errors import ConfigError
 from lidargrit.data.images import RangeImages
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import open_source
@@ -50,6 +53,21 @@ def test_scores_are_computed_again_with_weights_that_came_since(tmp_path, heard)
     assert second[1]["value"] != first[1]["value"]
     file.unlink()
     assert scored() == (second, [], True), "nothing to score with again"
+
+
+def test_systems_that_sample_nothing_are_refused_before_others_are_trained(tmp_path):
+    with pytest.raises(ConfigError, match=r"interpolation, which samples no new scans; .*: lidargrit complete SCANS"):
+        run_comparison(["memorised", "interpolation"], tmp_path / "table", COMPARISON)
+    assert not (tmp_path / "table").exists()
+
+
+def test_scores_of_samples_called_costs_are_not_taken_for_their_costs(tmp_path, monkeypatch):
+    made = run_comparison(["memorised"], tmp_path / "first", COMPARISON)
+    shutil.copytree(tmp_path / "first" / "memorised" / "samples", tmp_path / "costs")
+    monkeypatch.chdir(tmp_path)
+    paths = run_comparison(["costs"], tmp_path / "second", replace(COMPARISON, preset_settings=()))
+    values = [json.loads(path.read_text())["scores"][0]["value"] for path in (*made, *paths)]
+    assert values[0] == values[1]
 
 
 def test_scores_are_computed_again_for_other_reflectance_on_the_same_ranges(tmp_path):

@@ -253,10 +253,10 @@ def _of_first_seeds(pair: EvalPair, folder: Path) -> EvalPair:
 
 def _folder_name(system: str) -> str:
     """Return the name of a system's folder in the table; "." and ".." stand for the folders that they name."""
-    if system.endswith(_SCORES):
-        return Path(system).stem
     run, colon, settings = system.partition(":")
-    return (run if run.strip("./") else Path(run).resolve().name).replace("/", "_") + colon + settings.replace("/", "_")
+    name = (run if run.strip("./") else Path(run).resolve().name).replace("/", "_") + colon + settings.replace("/", "_")
+    name = Path(system).stem if system.endswith(_SCORES) else name
+    return f"{name}_" if f"{name}{_SCORES}" == COSTS else name  # else its scores would be its costs
 
 
 def _share(processes: int) -> None:
@@ -327,6 +327,7 @@ class _SystemJob:
         run, trained = locate(name), folder / "runs" / name
         if is_run(run):
             generator = load(run)
+            _require_new_scans(generator, system)
             return cls(system, run, None, generator.parse_sampling(settings), generator.sensor)
         held = open_source(name) if run.is_dir() and not is_preset(name) else None
         if held is not None and held.is_generated:
@@ -335,9 +336,17 @@ class _SystemJob:
                 raise ConfigError(got, "a folder of samples alone", "leave the settings out")
             return cls(system, run, None, None, held.sensor, held)
         preset = comparison.preset(name, check=not is_run(trained))
-        sampling = load_class(preset.generator).parse_sampling(settings)
+        generator = load_class(preset.generator)
+        _require_new_scans(generator, system)
+        sampling = generator.parse_sampling(settings)
         check_folder(trained, preset)
         return cls(system, trained, preset, sampling, preset.data.load_sensor())
+
+
+def _require_new_scans(generator: Generator | type[Generator], system: str) -> None:
+    if not generator.has_new_scans:
+        got, cure = f"{system}, which samples no new scans", f"use it with: lidargrit {generator.facts.first_command}"
+        raise ConfigError(got, "systems that do", cure)
 
 
 def _sample(
