@@ -100,6 +100,21 @@ def test_an_interrupted_report_says_what_the_scores_that_are_there_take(tmp_path
         assert capsys.readouterr().err == f"\nlidargrit evaluate: interrupted; {follows}\n"
 
 
+def test_a_file_that_was_finished_when_the_interrupt_came_is_told(tmp_path, monkeypatch, capsys):
+    """The same command is refused, for the file is there."""
+    file = tmp_path / "scans.lgz"
+
+    def interrupted(_):
+        file.write_bytes(b"")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lidargrit.cli.compress.run", interrupted)
+    assert main(["compress", "scans", str(file)]) == 130
+    assert capsys.readouterr().err == (
+        f"\nlidargrit compress: interrupted; {file} is there, and the same command with --overwrite begins anew\n"
+    )
+
+
 def hidden(folder: Path) -> list[Path]:
     return [path for path in folder.rglob(".*") if path.is_file()]
 

@@ -93,8 +93,10 @@ def _write_nowhere() -> None:
 
 def _what_follows(options: argparse.Namespace) -> str:
     """Say what the same command does when it is run again after an interruption."""
-    if (file := vars(options).get("json")) and file.is_file() and not options.overwrite:  # and its report is not
-        return f"{file} is there, and the same command with --overwrite begins anew"
+    words = vars(options)
+    there = [file for file in (words.get("out"), words.get("json")) if file and file.is_file()]  # a report may not be
+    if there and words.get("overwrite") is False:
+        return f"{there[0]} is there, and the same command with --overwrite begins anew"
     return "the same command goes on" if options.goes_on else "the same command begins anew"
 
 
