@@ -49,13 +49,18 @@ def read_everything(path: Path, bytes_at_most: int) -> Any:
         RefusedFileError: no file, too large a one, or one that holds more than tensors, numbers and their containers.
         OSError: it cannot be read.
     """
+    return unpickle(read_bounded(path, bytes_at_most))
+
+
+def read_bounded(path: Path, bytes_at_most: int) -> bytes:
+    """Return the bytes of a file, or raise RefusedFileError of no file or too large a one."""
     if not path.is_file():  # a pipe would hang
         raise RefusedFileError("which is no file")
     with path.open("rb") as file:
         data = file.read(bytes_at_most + 1)
     if len(data) > bytes_at_most:
         raise RefusedFileError(f"which is larger than {bytes_at_most / 1e6:.0f} MB")
-    return unpickle(data)
+    return data
 
 
 def unpickle(data: bytes) -> Any:

@@ -236,7 +236,7 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
     return ImageFileSource(text, folder, images) if images else DatasetSource(text, bad_points)
 
 
-def load_range_images(sources: Sequence[str], config: DataConfig, sensor: SensorModel | None = None) -> RangeImages:
+def load_range_images(sources: Sequence[str], config: DataConfig) -> RangeImages:
     """Open the range images of several sources as one set, to train from or to watch.
 
     Scans are projected once and then found in the cache: ``$LIDARGRIT_CACHE``, else ``lidargrit`` in the user's cache
@@ -245,24 +245,19 @@ def load_range_images(sources: Sequence[str], config: DataConfig, sensor: Sensor
     Args:
         sources: names of data sets, folders of scans, and prepared folders, as in :class:`DataConfig`.
         config: settings of projecting scans; its own sources are ignored.
-        sensor: sensor to project with, in place of the configuration's.
 
     Raises:
         DataError: no source, a source without a scan, generated scans, or prepared scans of another sensor.
         ScanError: a scan that cannot be used; ``bad_scans=skip`` leaves it out.
     """
-    return joined_images(open_to_train(sources, config), config, sensor)
+    return joined_images(open_to_train(sources, config), config)
 
 
-def joined_images(
-    opened: Sequence[DatasetSource | PreparedSource],
-    config: DataConfig,
-    sensor: SensorModel | None = None,
-) -> RangeImages:
+def joined_images(opened: Sequence[DatasetSource | PreparedSource], config: DataConfig) -> RangeImages:
     """Return the range images of sources that :func:`open_to_train` has opened as one set."""
     if config.own_sensors:
         return RangeImages.joined(None, [source.images(source.sensor, config) for source in opened])
-    sensor = sensor or config.load_sensor()
+    sensor = config.load_sensor()
     return RangeImages.joined(sensor, [source.images(sensor, config) for source in opened])
 
 

@@ -21,7 +21,7 @@ from lidargrit.core import reporting
 from lidargrit.core.environment import cache_folder, folder_in
 from lidargrit.core.errors import WeightsError
 from lidargrit.core.files import atomic_path
-from lidargrit.nn.published import RefusedFileError, float_tensors, unpickle
+from lidargrit.nn.published import RefusedFileError, float_tensors, read_bounded, unpickle
 
 FOLDER_VARIABLE = "LIDARGRIT_WEIGHTS"
 """Environment variable with the folder that is looked into first."""
@@ -83,16 +83,11 @@ def read_weights(published: PublishedWeights, path: Path) -> tuple[dict[str, Ten
         the tensors, float32, in memory of their own, without the counters that networks in training keep; and the
         SHA-256 of the file.
     """
-    if not path.is_file():  # a pipe would hang
-        raise _unfit(published, f"{path}, which is no file")
-    with path.open("rb") as file:
-        data = file.read(published.bytes_at_most + 1)
-    if len(data) > published.bytes_at_most:
-        raise _unfit(published, f"{path}, which is larger than {published.bytes_at_most / 1e6:.0f} MB")
-    checksum = hashlib.sha256(data).hexdigest()
-    if published.sha256 not in {None, checksum}:
-        raise _unfit(published, f"{path} with the SHA-256 {checksum}")
     try:
+        data = read_bounded(path, published.bytes_at_most)
+        checksum = hashlib.sha256(data).hexdigest()
+        if published.sha256 not in {None, checksum}:
+            raise _unfit(published, f"{path} with the SHA-256 {checksum}")
         parts = _members(published, data) if published.members else {"": data}
         tensors = {
             prefix + name: tensor
