@@ -84,7 +84,7 @@ def test_a_refused_name_is_told_how_to_get_in(served):
     assert status == 403
     assert why.endswith("open it as localhost, or serve it with --host NAME.")
     everywhere = application.Application(served.queue, "0.0.0.0")
-    answer = b"".join(everywhere({"HTTP_HOST": "box.lan"}, lambda *_: None)).decode()
+    answer = b"".join(everywhere({"HTTP_HOST": "box.lan", "REQUEST_METHOD": "GET"}, lambda *_: None)).decode()
     assert "open it by the numeric address of this machine, or serve it with --host NAME." in answer
 
 
