@@ -4,14 +4,17 @@ import compileall
 import copy
 import functools
 import gc
+import importlib
 import inspect
 import itertools
 import json
 import os
+import pickle
 import re
 import signal
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import jaxtyping
@@ -119,6 +122,23 @@ def _streets():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _parser():
+    """Build the parser of all verbs once for all commands in one process: with it, a small command took twice as long.
+
+    A verb that a test replaces gets a parser of its own.
+    """
+    from lidargrit import cli
+    from lidargrit.core import discovery
+
+    verbs = [importlib.import_module(f"lidargrit.cli.{name}") for name in discovery.names("cli")]
+    build = functools.cache(lambda _functions: build_parser())
+    build_parser = cli.build_parser
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "build_parser", lambda: build(tuple(verb.run for verb in verbs)))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _signal_handlers():
     """Fail a test that leaves signals handled otherwise; programs that later tests start inherit what is ignored."""
@@ -152,14 +172,50 @@ def untyped(monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    """Return a browser without a screen, one for all tests of a file."""
+class PoolHere:
+    """Does the work of a pool of processes here, with all that would pass between them pickled on its way."""
+
+    def map(self, do: Callable, shares: Iterable) -> Iterator:
+        for share in shares:
+            done, result = self._done(*pickle.loads(pickle.dumps((do, share))))
+            if not done:
+                raise pickle.loads(result)
+            yield pickle.loads(result)
+
+    def _done(self, do: Callable, share: object) -> tuple[bool, bytes]:
+        try:
+            return True, pickle.dumps(do(share))
+        except Exception as error:
+            return False, pickle.dumps(error)
+
+
+@pytest.fixture
+def pool_here(monkeypatch):
+    """Start no processes to share work, which import for seconds before they begin; others test that they start."""
+    monkeypatch.setattr("lidargrit.core.shares.process_pool", lambda count: nullcontext(PoolHere()))
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave pictures empty, which matplotlib takes seconds to draw."""
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _figure, file, **_settings: file.touch())
+
+
+@pytest.fixture(scope="session")
+def _browser(tmp_path_factory):
+    """Return a browser without a screen, one for all tests in one process."""
     if CHROMIUM is None:
         pytest.skip("needs Chromium")
     opened = Browser(tmp_path_factory.mktemp("profile"))
     yield opened
     opened.close()
+
+
+@pytest.fixture(scope="module")
+def browser(_browser):
+    """Return the browser for the tests of a file, whose last page goes on moving no longer than they run."""
+    yield _browser
+    _browser.send("Page.navigate", url="about:blank")
 
 
 @pytest.fixture(scope="session")

@@ -21,9 +21,14 @@ KINDS = {10: 0, 18: 0, 20: 0, 30: 1, 31: 1, 32: 1, 80: 2, 71: 3}  # by the bench
 
 
 @functools.cache
+def street(seed: int) -> RangeImage:
+    """Simulate one labelled street."""
+    return project(simulate(seed=seed, sensor=SENSOR), SENSOR)
+
+
 def streets(first: int, count: int) -> RangeImage:
-    """Simulate labelled streets."""
-    return RangeImage.stack([project(simulate(seed=first + seed, sensor=SENSOR), SENSOR) for seed in range(count)])
+    """Simulate labelled streets of consecutive seeds."""
+    return RangeImage.stack([street(first + number) for number in range(count)])
 
 
 def kind_of(label: int) -> int:

@@ -242,9 +242,9 @@ from lidargrit.scans.sensors import load_sensor
 from lidargrit.data.drives import DriveConfig, write_drives
 
 COMMANDS = {
-    "simulate": lambda out: write_drives(out, 6, DriveConfig(load_sensor("vlp16"))),
-    "export": lambda out: export_scans("simulated:6@vlp16", out, "pcd"),
-    "prepare": lambda out: prepare("simulated:6@vlp16", DataConfig(sensor="vlp16", workers=1), out),
+    "simulate": lambda out: write_drives(out, 4, DriveConfig(load_sensor("vlp16"))),
+    "export": lambda out: export_scans("simulated:4@vlp16", out, "pcd"),
+    "prepare": lambda out: prepare("simulated:4@vlp16", DataConfig(sensor="vlp16", workers=1), out),
 }
 
 def begun(command, out):

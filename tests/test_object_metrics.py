@@ -1,5 +1,6 @@
 """Metrics of what stands in scans: against slow loops and SciPy, and how they rank known damages."""
 
+import functools
 import math
 
 import numpy as np
@@ -17,6 +18,7 @@ from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 
 GENERATED, REAL = (100, 6), (200, 6)  # first seed and number of streets
+FEW_GENERATED, FEW_REAL = (100, 4), (200, 4)  # for slow loops
 EDGES = {  # as object_statistics documents them
     "number_a_scan": [0, 1, 2, 3, 5, 9, 17, 33],
     "length_m": np.geomspace(0.1, 20, 14),
@@ -33,9 +35,10 @@ def score(name, generated, real, variant="labelled"):
     return metric.compute()
 
 
-def measured(images):
+@functools.cache
+def measured(first, count):
     """Return rows (image, kind, returns, length, height, distance, upper share), by a loop over objects and points."""
-    rows = []
+    images, rows = streets(first, count), []
     for index in range(len(images)):
         points = points_of_pixels(images[index]).double().numpy()
         for pixels in searched_objects(images[index]):
@@ -59,9 +62,8 @@ def measured(images):
 
 
 def test_objects_are_those_of_a_slow_search():
-    images = streets(*GENERATED)[:4]
-    found = objects_in(images)
-    expected = measured(images)
+    found = objects_in(streets(*FEW_GENERATED))
+    expected = measured(*FEW_GENERATED)
     assert len(expected) > 12
     assert {row[1] for row in expected} == {0, 1, 2, 3}
     assert np.allclose(sorted(zip(*found, strict=True)), expected, atol=1e-9)
@@ -74,8 +76,7 @@ def test_an_object_may_lie_across_the_first_and_the_last_column():
 
 
 def test_the_statistics_are_those_of_a_loop():
-    generated, real = streets(*GENERATED)[:4], streets(*REAL)[:4]
-    rows = [measured(images) for images in (generated, real)]
+    rows = [measured(*FEW_GENERATED), measured(*FEW_REAL)]
     numbers, shapes, weights = [], [], []
     for kind in range(4):
         of_kind = [[row for row in each if row[1] == kind] for each in rows]
@@ -86,7 +87,7 @@ def test_the_statistics_are_those_of_a_loop():
             np.mean([squared_distance(*([r[at] for r in e] for e in of_kind), EDGES[n]) for n, at in columns])
         )
         weights.append(sum(len(each) / len(every) for each, every in zip(of_kind, rows, strict=True)) / 2)
-    result = score("object_statistics", generated, real)
+    result = score("object_statistics", streets(*FEW_GENERATED), streets(*FEW_REAL))
     assert math.isclose(result.value, math.sqrt((np.mean(numbers) + np.dot(shapes, weights)) / 2), rel_tol=1e-9)
     for which, each in zip(("generated", "real"), rows, strict=True):
         vehicles = [row for row in each if row[1] == 0]

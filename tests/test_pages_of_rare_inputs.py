@@ -1,17 +1,13 @@
-"""Pages in a browser, with inputs that are rare: a sensor of one row, points without a pixel, a file that changes."""
+"""Pages in a browser, with inputs that are rare: a sensor of one row, points without a pixel."""
 
-import os
 from dataclasses import replace
 
 import torch
 
-import lidargrit
-from lidargrit.data.formats import load
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 from lidargrit.viewer.interactive import write_page
 from lidargrit.viewer.scan_sets import ScanSet
-from served import running
 
 
 def test_a_sensor_of_one_row_is_coloured_by_its_row(browser, tmp_path):
@@ -40,21 +36,3 @@ def test_a_mark_on_a_point_that_the_next_scan_does_not_have_goes_away(browser, t
     assert browser.troubles() == []
     assert browser.run("document.querySelector('#panes').getAttribute('aria-busy')") == "false"
     assert browser.run("document.querySelector('[data-part=readout]').textContent") == ""
-
-
-def test_a_file_that_changed_after_it_was_chosen_is_told_apart_from_a_dead_server(browser, tmp_path):
-    path = tmp_path / "mine.ply"
-    load("ply").write(path, lidargrit.simulate(seed=5))
-    with running(tmp_path / "runs") as served:
-        browser.send("Page.navigate", url=served.url)
-        browser.wait("document.readyState === 'complete' && typeof desk !== 'undefined' && desk?.busy === false")
-        root = browser.send("DOM.getDocument")["root"]["nodeId"]
-        node = browser.send("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
-        browser.send("DOM.setFileInputFiles", files=[str(path)], nodeId=node)
-        browser.run("document.querySelector('#file').files[0].lastModified")  # until asked, a browser has not looked
-        path.write_bytes(path.read_bytes() + b" ")
-        os.utime(path, (0, 0))  # not the same millisecond
-        browser.click("#tasks [value=ahead]")
-        browser.wait("!document.querySelector('#error').hidden")
-        told = browser.run("document.querySelector('#error').textContent")
-    assert told == "mine.ply has changed since you chose it, or can no longer be read. Choose it again."

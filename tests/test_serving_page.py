@@ -1,5 +1,6 @@
 """What happens when somebody clicks and types on the page that is served, in a browser."""
 
+import os
 import re
 import time
 from pathlib import Path
@@ -236,6 +237,18 @@ def test_a_bad_file_is_told_in_one_line(opened, tmp_path):
         assert why in said(opened), name
         assert "/" not in said(opened).replace("/complete", ""), "no place on the server's disk"
     assert opened.run("document.querySelector('#error').getAttribute('role')") == "alert"
+
+
+def test_a_file_that_changed_after_it_was_chosen_is_told_apart_from_a_dead_server(opened, scan_file, tmp_path):
+    path = tmp_path / "mine.ply"
+    path.write_bytes(scan_file.read_bytes())
+    choose_file(opened, path)
+    opened.run("document.querySelector('#file').files[0].lastModified")  # until asked, a browser has not looked
+    path.write_bytes(path.read_bytes() + b" ")
+    os.utime(path, (0, 0))  # not the same millisecond
+    opened.click("#tasks [value=ahead]")
+    opened.wait("!document.querySelector('#error').hidden")
+    assert said(opened) == "mine.ply has changed since you chose it, or can no longer be read. Choose it again."
 
 
 def test_everything_is_reached_by_keys_and_has_a_name(opened):

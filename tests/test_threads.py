@@ -20,7 +20,7 @@ import os, sys
 from lidargrit.cli import main
 {before}
 loaded = "torch" in sys.modules
-main(["list", "presets"])
+main([])  # its help
 print(loaded, *(os.environ.get(name, "unset") for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")), file=sys.stderr)
 """
 
@@ -28,7 +28,7 @@ print(loaded, *(os.environ.get(name, "unset") for name in ("OMP_WAIT_POLICY", "G
 FAULTS = """
 import resource, sys
 from lidargrit.cli import main
-sys.argv = ["lidargrit", "list", "presets"]
+sys.argv = ["lidargrit"]
 main()
 length = 27
 b"x" * (1 << length)
@@ -55,7 +55,7 @@ def test_what_the_user_has_set_stays():
 
 
 def test_a_program_that_has_loaded_torch_keeps_its_environment():
-    assert waiting_in_the_command("import torch") == ["True", "unset", "unset"]
+    assert waiting_in_the_command("sys.modules['torch'] = sys") == ["True", "unset", "unset"]
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries keep memory by rules of their own")

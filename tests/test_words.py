@@ -54,7 +54,7 @@ FACTS = {
     "train lidargrit_demo nowhere --dry-run": "settings",
     "inspect simulated:1:test": "points",
     "prepare simulated:1:test": "images",
-    "fit-sensor simulated:2:test -n 2": "agree_share",
+    "fit-sensor simulated:2@vlp16 -n 2": "agree_share",
     "evaluate simulated:2:val simulated:2:test --metrics bev_jsd": "scores",
 }
 

@@ -259,32 +259,33 @@ def test_a_full_disk_while_logging(tmp_path, interrupt, capsys):
 
 
 KILLER = """
-import os, random, signal, sys, time
+import json, os, random, signal, sys, time
 import lightning_fabric, safetensors.torch
 import lidargrit.cli, lidargrit.inference.samples, lidargrit.systems.lidargrit.system
 import lidargrit.generation.presets, lidargrit.training
 
-rng = random.Random(int(sys.argv[1]))
-for _ in range(int(sys.argv[2])):
-    child = os.fork()
-    if not child:
-        os._exit(lidargrit.cli.main(sys.argv[4:]))
-    time.sleep(rng.uniform(0, float(sys.argv[3])))
-    os.kill(child, signal.SIGKILL)
-    if os.waitpid(child, 0)[1] not in (0, signal.SIGKILL):
-        sys.exit("a killed command left something that the next could not go on from")
+for longest_s, words in json.loads(sys.argv[1]):
+    rng = random.Random(5)
+    for _ in range(4):
+        child = os.fork()
+        if not child:
+            os._exit(lidargrit.cli.main(words))
+        time.sleep(rng.uniform(0, longest_s))
+        os.kill(child, signal.SIGKILL)
+        if os.waitpid(child, 0)[1] not in (0, signal.SIGKILL):
+            sys.exit("a killed command left something that the next could not go on from")
 """
 
 
-def killed_often(times: int, longest_s: float, words: list[str]) -> None:
-    command = [sys.executable, "-c", KILLER, "5", str(times), str(longest_s), *words]
+def test_commands_that_are_killed_again_and_again_end_with_the_same_weights_and_scans(
+    uninterrupted, finished, tmp_path
+):
+    """To the byte. All are forks of one process, so that modules are imported once."""
+    words = train_words(tmp_path / "run", *LONG)
+    sampling = ["sample", str(finished["run"]), str(tmp_path / "new"), "-n", "20"]
+    command = [sys.executable, "-c", KILLER, json.dumps([(1.0, words), (0.4, sampling)])]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_a_run_that_is_killed_again_and_again_ends_with_the_same_weights(uninterrupted, tmp_path):
-    words = train_words(tmp_path / "run", *LONG)
-    killed_often(4, 1.0, words)
     assert main(words) == 0
     assert (tmp_path / "run" / "model.safetensors").read_bytes() == uninterrupted
     assert hidden(tmp_path / "run" / "tokenizer") == hidden(tmp_path / "run" / "transformer") == []
@@ -293,13 +294,7 @@ def test_a_run_that_is_killed_again_and_again_ends_with_the_same_weights(uninter
             json.loads(line)["scans_seen"] for line in (tmp_path / "run" / stage / "log.jsonl").read_text().splitlines()
         ]
         assert seen == sorted(set(seen)), "every line once"
-
-
-def test_sampling_that_is_killed_again_and_again_ends_with_the_same_scans(finished, tmp_path):
-    """To the byte."""
-    words = ["sample", str(finished["run"]), str(tmp_path / "new"), "-n", "20"]
-    killed_often(4, 0.4, words)
-    assert main(words) == 0
+    assert main(sampling) == 0
     assert main(["sample", str(finished["run"]), str(tmp_path / "whole"), "-n", "20"]) == 0
     assert contents(tmp_path / "new") == contents(tmp_path / "whole")
 
