@@ -4,7 +4,6 @@ import compileall
 import copy
 import functools
 import gc
-import importlib
 import inspect
 import itertools
 import json
@@ -119,23 +118,6 @@ def _streets():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lidargrit.simulator.simulate", simulate_once)
         patch.setattr("lidargrit.simulate", simulate_once)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _parser():
-    """Build the parser of all verbs once for all commands in one process: with it, a small command took twice as long.
-
-    A verb that a test replaces gets a parser of its own.
-    """
-    from lidargrit import cli
-    from lidargrit.core import discovery
-
-    verbs = [importlib.import_module(f"lidargrit.cli.{name}") for name in discovery.names("cli")]
-    build = functools.cache(lambda _functions: build_parser())
-    build_parser = cli.build_parser
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "build_parser", lambda: build(tuple(verb.run for verb in verbs)))
         yield
 
 
