@@ -8,12 +8,10 @@ import inspect
 import itertools
 import json
 import os
-import pickle
 import re
 import signal
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jaxtyping
@@ -152,35 +150,6 @@ def heard() -> Iterator[list[str]]:
 def untyped(monkeypatch):
     """Let values of any type reach our own checks, as they do outside of the tests."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-
-
-class PoolHere:
-    """Does the work of a pool of processes here, with all that would pass between them pickled on its way."""
-
-    def map(self, do: Callable, shares: Iterable) -> Iterator:
-        for share in shares:
-            done, result = self._done(*pickle.loads(pickle.dumps((do, share))))
-            if not done:
-                raise pickle.loads(result)
-            yield pickle.loads(result)
-
-    def _done(self, do: Callable, share: object) -> tuple[bool, bytes]:
-        try:
-            return True, pickle.dumps(do(share))
-        except Exception as error:
-            return False, pickle.dumps(error)
-
-
-@pytest.fixture
-def pool_here(monkeypatch):
-    """Start no processes to share work, which import for seconds before they begin; others test that they start."""
-    monkeypatch.setattr("lidargrit.core.shares.process_pool", lambda count: nullcontext(PoolHere()))
-
-
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Leave pictures empty, which matplotlib takes seconds to draw."""
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _figure, file, **_settings: file.touch())
 
 
 @pytest.fixture(scope="session")

@@ -136,8 +136,8 @@ def test_dry_run_finds_prepared_scans_of_another_sensor(tmp_path, capsys):
     assert "(64x64); wanted the rays of " in the_one_line(capsys.readouterr().err, "train")
 
 
-def told_at_once(preset):
-    return dict.fromkeys(preset.training.keys() - preset.frozen.keys(), 10**18)
+def told_at_once(preset, without=()):
+    return dict.fromkeys(preset.training, 10**18)
 
 
 @pytest.mark.parametrize("preset", discovery.names("presets"))
@@ -156,12 +156,12 @@ def test_every_preset_has_a_plan(preset, tmp_path, capsys, monkeypatch):
 def test_a_plan_tells_which_stages_are_taken_and_not_trained(tmp_path, capsys, monkeypatch):
     words = ["train", "lidargrit_compact_pixels", str(tmp_path / "none"), "--dry-run"]
     taking = ["--set", *(f"training.{stage}.start=frozen:pretrained" for stage in ("tokenizer", "transformer"))]
-    monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     assert main([*words, "--json", *taking]) == 0
     stages = {stage["name"]: stage for stage in json.loads(capsys.readouterr().out)["stages"]}
     assert {name for name, stage in stages.items() if not stage["taken_from"]} == {"pixels"}
     assert stages["transformer"]["taken_from"] == "pretrained"
     assert stages["transformer"]["flops"] == 0 < stages["pixels"]["flops"]
+    monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
     assert main([*words, *taking, "training.pixels.start=pretrained"]) == 0
     text = capsys.readouterr().out
     assert "transformer: 4,539,136 parameters, taken from pretrained and not trained" in text
@@ -303,10 +303,10 @@ def test_doctor_tells_versions_and_room(typed):
     assert os.environ["LIDARGRIT_CACHE"] in output
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_demo_writes_its_page_and_writes_it_again(tmp_path, typed, monkeypatch):
     monkeypatch.setattr(*ONE_METRIC)
     monkeypatch.setattr("lidargrit.viewer.demo.measure", lambda _preset: [])  # seconds, for an estimate
+    monkeypatch.setattr("lidargrit.viewer._matplotlib._DOTS_PER_INCH", 20)
     monkeypatch.setattr("lidargrit.viewer.demo._NUM_SAMPLES", 11)  # as many as its pictures show
     words = ("demo", "--out", tmp_path / "demo", "--set", *TINY, *PIXELS)
     assert f"done: look at {tmp_path / 'demo'}" in typed(*words)

@@ -121,7 +121,6 @@ def test_clean_ranges_and_probabilities_lie_beside_the_scans(drive):
     assert seen["return_probability"][returned].mean() > seen["return_probability"][~returned].mean()
 
 
-@pytest.mark.usefixtures("pool_here")
 def test_what_is_there_is_kept_and_more_is_added(drive, tmp_path):
     config = DriveConfig(SENSOR, seed=6, frames=3, clean=True)
     write_drives(tmp_path / "out", 2, config)

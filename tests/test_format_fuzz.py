@@ -14,7 +14,7 @@ from lidargrit.scans.types import Scan
 
 
 def test_damaged_files_are_a_scan_or_one_line():
-    table = fuzz(900)
+    table = fuzz(1500)
     assert len(table) >= 6
     for name, counts in table.items():
         assert set(counts) <= set(WELL), (name, counts)

@@ -194,7 +194,6 @@ def test_machines_share_the_work_and_wait_for_one_another(tree, tmp_path, small_
         prepare(str(tree), SIMULATED, rank=2, world_size=2)
 
 
-@pytest.mark.usefixtures("pool_here")
 def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
     KittiOdometry(tree).path(4).write_bytes(bytes(33))
     with pytest.raises(ScanError, match=r"got 33 bytes in .*--bad-scans skip"):
@@ -213,7 +212,7 @@ def begun():
     if child := os.fork():
         return child
     try:
-        prepare("simulated:6@vlp16", DataConfig(sensor="vlp16", workers=1), folder)
+        prepare("simulated:8@vlp16", DataConfig(sensor="vlp16", workers=1), folder)
         os._exit(0)
     finally:
         os._exit(1)
@@ -232,8 +231,8 @@ sys.exit(os.waitpid(begun(), 0)[1] != 0 or not killed)
 
 def test_killed_at_any_moment_it_goes_on_and_ends_the_same(tmp_path, small_shards):
     subprocess.run([sys.executable, "-c", KILLED_AND_FINISHED, str(tmp_path / "killed")], check=True)
-    prepare("simulated:6@vlp16", replace(SIMULATED, sensor="vlp16"), tmp_path / "whole")
-    assert len(list((tmp_path / "whole").glob("images.zarr/range/c.*"))) == 3
+    prepare("simulated:8@vlp16", replace(SIMULATED, sensor="vlp16"), tmp_path / "whole")
+    assert len(list((tmp_path / "whole").glob("images.zarr/range/c.*"))) == 4
     names = [sorted(str(path.relative_to(folder)) for path in folder.rglob("*")) for folder in tmp_path.iterdir()]
     assert names[0] == names[1], "nothing half-written is left"
     assert same(tmp_path / "killed", tmp_path / "whole")

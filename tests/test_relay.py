@@ -7,8 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread
@@ -32,13 +30,11 @@ from seeded_images import SeededImages
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "benchmarks" / "relay"))
 
-import leg  # noqa: E402
 from leg import Leg, run_leg  # noqa: E402
 from packing import MANIFEST, RELAY_FILE, pack, unpack  # noqa: E402
-from streets import Streets, write_streets  # noqa: E402
+from streets import Streets  # noqa: E402
 
-HDL64E = load_sensor("hdl64e_kitti_odometry").with_columns(32, 1)
-SENSOR = replace(HDL64E, elevation_rad=HDL64E.elevation_rad[::4])  # a step on all rows takes twice as long
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(32, 1)
 IMAGES = RangeImages(SENSOR, [SeededImages(SENSOR, 8)])
 STEPS = TrainingConfig(scans=150, batch_size=1, learning_rate=1e-3, average_over_scans=20, validate_every=10**6)
 MIB = 2**20
@@ -166,16 +162,7 @@ def toy_preset():
     return replace(preset, model=model, data=data, training=few)
 
 
-@contextmanager
-def simulated_here(folder, sensor_name, columns, first_seed, _processes):
-    """Simulate the first file of streets before the training instead of beside it."""
-    folder.mkdir()
-    write_streets(folder, load_sensor(sensor_name).with_columns(*columns), first_seed, 1, first_seed + 8)
-    yield
-
-
-def test_two_legs_from_two_fresh_folders_train_all_stages_in_order(tmp_path, monkeypatch):
-    """The first leg simulates in processes of its own, the second, which would start them alike, in this one."""
+def test_two_legs_from_two_fresh_folders_train_all_stages_in_order(tmp_path):
     first = toy_preset()
     first.training["pixels"] = replace(first.training["pixels"], scans=10**6, checkpoint_every=2)
     Thread(target=terminate_once_there_is, args=[tmp_path / "one" / "pixels" / "checkpoint.safetensors"]).start()
@@ -189,8 +176,6 @@ def test_two_legs_from_two_fresh_folders_train_all_stages_in_order(tmp_path, mon
     second = toy_preset()
     reached = int(told["legs"][0]["pixels.scans"])
     second.training["pixels"] = replace(second.training["pixels"], scans=reached + 4)
-    monkeypatch.setattr(leg, "simulating", simulated_here)
-    monkeypatch.setattr(leg, "ProcessPoolExecutor", lambda processes, _context: ThreadPoolExecutor(processes))
     run_leg(Leg("toy", tmp_path / "two", 10**6, 1, 1), second)
     told = read_json(tmp_path / "two" / RELAY_FILE)
     assert told["finished"] == ["tokenizer", "pixels", "transformer"]

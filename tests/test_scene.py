@@ -44,14 +44,12 @@ def test_one_state_one_scene(theme):
     one = sample_scene(np.random.default_rng(7), theme)
     np.random.seed(2)  # noqa: NPY002
     two = sample_scene(np.random.default_rng(7), theme)
-    alike = [(one.standing, two.standing)]
     for time_s in (0.0, 0.7):
-        alike.append((mesh_of_objects(one.objects(time_s)), mesh_of_objects(two.objects(time_s))))
-        assert np.array_equal(one.sensor_pose(time_s), two.sensor_pose(time_s))
-    for first, second in alike:
+        first, second = mesh_of(one, time_s), mesh_of(two, time_s)
         for field in FIELDS:
             assert np.array_equal(getattr(first, field), getattr(second, field)), field
-    assert len(sample_scene(np.random.default_rng(8), theme).standing) != len(one.standing)
+        assert np.array_equal(one.sensor_pose(time_s), two.sensor_pose(time_s))
+    assert len(mesh_of(sample_scene(np.random.default_rng(8), theme))) != len(mesh_of(one))
 
 
 def test_mixed_draws_mostly_streets_with_houses():
@@ -277,7 +275,7 @@ def test_backdrop_leaves_little_bare_sky(scenes):
     """In most directions something stands higher than the sensor's top ring."""
     share = {theme: [] for theme in THEMES}
     for (theme, seed), scene in scenes.items():
-        if seed > 1:
+        if seed > 3:
             continue
         corner = mesh_of(scene).triangles_m.reshape(-1, 3)
         flat = np.hypot(corner[:, 0], corner[:, 1])
