@@ -54,7 +54,8 @@ def fit_firings(points_m: Points) -> Fitted | None:
     row = _lasers(points_m)
     if row is None:
         return None
-    some = _Fit(points_m[::_ONE_IN], row[::_ONE_IN])
+    chosen = _some_of_each(row)
+    some = _Fit(points_m[chosen], row[chosen])
     some.find_cones()
     some.find_angles()
     return some.of_all(points_m, row).result()
@@ -69,6 +70,13 @@ def _lasers(points_m: Points) -> Int64[np.ndarray, " n"] | None:
     if row[-1] + 1 not in _LASERS or len(row) < _POINTS_A_LASER * (row.max() + 1):
         return None
     return row
+
+
+def _some_of_each(row: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+    """Return the numbers of a share of the points, among them at least one of every laser."""
+    chosen = np.arange(0, len(row), _ONE_IN)
+    lasers, first = np.unique(row, return_index=True)
+    return np.sort(np.append(chosen, first[~np.isin(lasers, row[chosen])]))
 
 
 class _Fit:
