@@ -195,9 +195,10 @@ def test_machines_share_the_work_and_wait_for_one_another(tree, tmp_path, small_
 
 
 def test_a_bad_scan_met_by_another_process_is_told_here(tree, small_shards):
-    KittiOdometry(tree).path(4).write_bytes(bytes(33))
-    with pytest.raises(ScanError, match=r"got 33 bytes in .*--bad-scans skip"):
+    np.full((8, 4), np.nan, np.float32).tofile(KittiOdometry(tree).path(4))  # only reading finds it, in its process
+    with pytest.raises(ScanError, match=r"8 of 8 points with NaN .*--bad-scans skip") as told:
         load(tree, workers=2)
+    assert "_made_by_processes" in [entry.name for entry in told.traceback]
 
 
 KILLED_AND_FINISHED = """
