@@ -50,11 +50,11 @@ def _run(words: list[str], is_program: bool = False) -> int:
         _keep_freed_memory()
         if isinstance(sys.stdout, io.TextIOWrapper):  # names that its encoding lacks, as that of some locales
             sys.stdout.reconfigure(errors="backslashreplace")
-    parser = build_parser()
+    verb = words[0] if words and words[0] in _modules_of_verbs() else ""
+    parser = build_parser(verb)
     try:
         options = _parsed(parser, words)
     except UsageError as error:
-        verb = words[0] if words and words[0].replace("-", "_") in discovery.names("cli") else ""
         print(f"lidargrit {verb}".rstrip() + f": {error}", file=sys.stderr)
         return 2
     if options.verb is None:
@@ -127,8 +127,13 @@ def _keep_freed_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
-def build_parser() -> Parser:
-    """Return the parser of all verbs; the verbs themselves are not imported beyond their words."""
+def _modules_of_verbs() -> dict[str, str]:
+    """Return verbs as a user types them, and the name of each one's module."""
+    return {name.replace("_", "-"): name for name in discovery.names("cli")}
+
+
+def build_parser(verb: str = "") -> Parser:
+    """Return the parser of one verb, or of all verbs, which takes ten times as long; what they do is not imported."""
     raw: dict[str, Any] = {"formatter_class": HelpFormatter}
     parser = Parser(prog="lidargrit", usage="lidargrit VERB ...", description=_EXAMPLES, epilog=EXIT_CODES, **raw)
     parser.add_argument("--version", action="version", version=f"lidargrit {__version__}")
@@ -136,19 +141,21 @@ def build_parser() -> Parser:
     how = "print a script by which this shell completes verbs, options and names, see docs/how-to/from-programs.md"
     parser.add_argument("--print-completion", choices=SHELLS, default="", help=how)
     verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
-    for name in discovery.names("cli"):
-        verb = importlib.import_module(f"lidargrit.cli.{name}")
+    modules = _modules_of_verbs()
+    for word in [verb] if verb else modules:
+        name = modules[word]
+        module = importlib.import_module(f"lidargrit.cli.{name}")
         sub = verbs.add_parser(
-            name.removesuffix("_").replace("_", "-"),
+            word,
             help=discovery.summary("cli", name),
-            description=f"examples:\n{verb.EXAMPLES}",
+            description=f"examples:\n{module.EXAMPLES}",
             **raw,
         )
         sub.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=argparse.SUPPRESS)
         # A verb that keeps what it has done, and goes on there, says so itself, and so does one that waits for others.
         sub.set_defaults(goes_on=False, waits=False)
-        verb.add_arguments(sub)
-        sub.set_defaults(run=verb.run, words=sub)
+        module.add_arguments(sub)
+        sub.set_defaults(run=module.run, words=sub)
         sub.usage = sub.short_usage()
     return parser
 
