@@ -170,35 +170,34 @@ def test_training_flops_are_three_forward_passes_of_a_plain_stack():
     assert 2.8 * one_pass < counted < 3.0 * one_pass  # the first layer needs no gradient of its input
 
 
-@pytest.fixture
-def count_once(monkeypatch):
-    """Return a function that counts the operations of a preset, and of none twice; budgets count by it, too."""
-    counted = {}
+@pytest.fixture(autouse=True)
+def _counted_once(monkeypatch):
+    """Count the operations of no preset twice in a test, which takes seconds; budgets count by it, too."""
+    counted, count = {}, compute.stage_costs
 
-    def count(preset):
+    def costs(preset):
         if repr(preset) not in counted:
-            counted[repr(preset)] = training_flops(preset)
+            counted[repr(preset)] = count(preset)
         return counted[repr(preset)]
 
-    monkeypatch.setattr(compute, "training_flops", count)
-    return count
+    monkeypatch.setattr(compute, "stage_costs", costs)
 
 
-def test_a_budget_scales_all_stages_alike(count_once):
+def test_a_budget_scales_all_stages_alike():
     preset = load_preset("lidargrit_demo", MODEL)
-    cost = sum(count_once(preset).values())
+    cost = sum(training_flops(preset).values())
     half = with_budget(preset, cost / 2)
     for stage, fit in preset.training.items():
         assert half.training[stage].scans == pytest.approx(fit.scans / 2, abs=fit.batch_size)
     assert with_budget(load_preset("marginal"), 1.0) == load_preset("marginal")
     vae = load_preset("lidarvae_small")
-    short = with_budget(vae, sum(count_once(vae).values()) / 4)
+    short = with_budget(vae, sum(training_flops(vae).values()) / 4)
     assert short.model.warmup_scans == pytest.approx(vae.model.warmup_scans / 4, rel=0.01)
     with pytest.raises(ConfigError, match="at least one batch") as refused:
         with_budget(preset, 1e6)
     enough = with_budget(preset, float(refused.value.cure.removeprefix("raise it to ")))
     assert all(fit.scans >= fit.batch_size for fit in enough.training.values())
-    lacking = load_preset("r2flow_small")
+    lacking = load_preset("r2flow_small", ["model.hdit.depths=[1,1]", "model.hdit.heads=[1,1]"])
     lacking = replace(lacking, model=replace(lacking.model, reflow=ReflowConfig()))
     for count in (training_flops, lambda preset: with_budget(preset, 1e13)):
         with pytest.raises(ConfigError, match=r"without training\.reflow, a stage of model=r2flow"):
@@ -211,12 +210,12 @@ def test_images_that_only_count_mark_surfaces_that_return():
     assert marked.has_reflectance
 
 
-def test_stages_that_are_taken_from_another_run_are_not_counted(count_once):
+def test_stages_that_are_taken_from_another_run_are_not_counted():
     preset = load_preset(
         "lidargrit_compact_pixels",
         [f"training.{stage}.start=frozen:pretrained" for stage in ("tokenizer", "transformer")],
     )
-    flops = count_once(preset)
+    flops = training_flops(preset)
     assert list(flops) == ["pixels"]
     scaled = with_budget(preset, flops["pixels"] / 4)
     assert scaled.training["pixels"].scans == pytest.approx(preset.training["pixels"].scans / 4, rel=0.01)

@@ -32,14 +32,14 @@ from lidargrit.training.optimiser import make_optimiser
 from lidargrit.training.stage import StageTraining, begin_training
 from tiny_runs import train_words
 
-SENSOR = load_sensor("hdl64e_kitti_odometry")
+SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64)
 
-STEADY = [  # no random numbers of a process, only of a scan; codes that restart and follow means
+STEADY = [  # no random numbers of a process, only of a scan; codes that restart and follow means; four steps a stage
     "model.tokenizer.dropout=0",
     *[f"model.transformer.{part}_dropout=0" for part in ("embedding", "residual")],
     "training.tokenizer.augmentations=[flip,roll]",
     *[f"training.{stage}.precision=fp32" for stage in ("tokenizer", "transformer")],
-    "training.tokenizer.scans=24",
+    "training.tokenizer.scans=16",
     "training.tokenizer.validate_every=4",
     "training.transformer.scans=32",
     "training.transformer.validate_every=8",
