@@ -203,6 +203,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
     images = read_samples(tmp_path).batch([0, 1])
     assert torch.equal(images.range_m[0], images.range_m[1]), "the likeliest tokens do not depend on the seed"
     manifest = json.loads((tmp_path / "samples.json").read_text())
+    assert manifest["generator"] == "lidargrit"
     assert manifest["sampling"] == {
         "temperature": 0.0,
         "top_k": 0,
@@ -216,14 +217,6 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "weights": "fp32",
         "decoder": "fp32",
     }
-
-
-def test_samples_tell_what_they_cost(run_folder, tmp_path, typed):
-    typed("sample", run_folder, tmp_path, "-n", 1)
-    manifest = json.loads((tmp_path / "samples.json").read_text())
-    assert manifest["generator"] == "lidargrit"
-    assert manifest["cost_per_scan"]["network_evaluations"] == 8 * 8 + 1
-    assert manifest["cost_per_scan"]["flops"] > 1e6
 
 
 def test_evaluate_prints_a_table_and_writes_json(samples, tmp_path, typed):

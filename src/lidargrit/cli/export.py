@@ -34,8 +34,8 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.data.export import export_scans
     from lidargrit.data.recordings import KINDS
     from lidargrit.data.trajectories import read_trajectory
-    from lidargrit.scans.motion import UndoMotion
     from lidargrit.scans.sensors import load_sensor
+    from lidargrit.scans.undo_motion import UndoMotion
 
     config = scan_settings(options, max_scans=options.count).data
     sensor = config.with_projection(load_sensor(options.sensor)) if options.sensor else None

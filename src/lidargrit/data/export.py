@@ -13,10 +13,10 @@ from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, ScanIdentity
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
-from lidargrit.scans.motion import UndoMotion
 from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import Scan
+from lidargrit.scans.undo_motion import UndoMotion
 
 MANIFEST = "export.json"
 

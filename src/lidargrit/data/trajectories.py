@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_text
 from lidargrit.data.datasets.shared.odometry import motions, table
-from lidargrit.scans.motion import Trajectory
+from lidargrit.scans.undo_motion import Trajectory
 
 _KITTI_COLUMNS = 12
 _TUM = "rows of 8 numbers: time in s, x, y, z in m, and a quaternion qx, qy, qz, qw"

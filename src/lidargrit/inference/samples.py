@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
 from functools import lru_cache, partial
 from itertools import chain, islice
 from pathlib import Path
@@ -52,7 +51,6 @@ def write_samples(
     manifest: dict[str, Any] = {
         **sampling_identity(generator, run_folder, settings),
         "generator": generator.public_name(),
-        "cost_per_scan": asdict(generator.cost(settings)),
         "sensor": generator.sensor.to_json(),
     }
     if variant := recorded_projection(run_folder):
@@ -144,8 +142,8 @@ def _missing(folder: Path, seeds: Sequence[int]) -> list[int]:
 
 
 def _same(there: dict[str, Any], manifest: dict[str, Any]) -> bool:
-    """Return whether samples there were sampled as these will be; their cost follows from the rest."""
-    return {**there, "cost_per_scan": None} == {**manifest, "cost_per_scan": None}
+    """Return whether samples there were sampled as these will be."""
+    return {name: value for name, value in there.items() if name != "cost_per_scan"} == manifest  # of earlier versions
 
 
 def _write_image(path: Path, image: RangeImage) -> None:

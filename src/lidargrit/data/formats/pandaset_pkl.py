@@ -16,8 +16,8 @@ from lidargrit.core.files import read_json, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, read_bytes
 from lidargrit.data.formats.shared.pandas_pickle import columns_of_table
 from lidargrit.scans.columns import ScanParts, treated_parts
-from lidargrit.scans.motion import Trajectory
 from lidargrit.scans.types import Scan
+from lidargrit.scans.undo_motion import Trajectory
 
 _FORMAT = "a frame of PandaSet as it is published: lidar/NN.pkl.gz beside poses.json and timestamps.json"
 _FILE_BYTES_AT_MOST, _UNPACKED_BYTES_AT_MOST = 50_000_000, 64_000_000  # a frame has 4 MB, unpacked 8

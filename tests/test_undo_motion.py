@@ -11,8 +11,8 @@ import lidargrit
 from lidargrit.cli import main
 from lidargrit.core.errors import DataError, ScanError
 from lidargrit.data.trajectories import read_trajectory
-from lidargrit.scans.motion import Trajectory, UndoMotion
 from lidargrit.scans.types import Scan
+from lidargrit.scans.undo_motion import Trajectory, UndoMotion
 from lidargrit.simulator import observe, poses_of
 from lidargrit.simulator.beams import REVOLUTION_S, Beams
 
