@@ -1,7 +1,8 @@
 """Scores of generators compared alike, docs/results/scores.csv → tables and a picture; ``add`` takes more scores in.
 
     python benchmarks/fair_table.py table --metrics flying_points wall_straightness
-    python benchmarks/fair_table.py table --trained-on "simulated:2000:train, then 38 KITTI scans" --data kitti_odometry
+    python benchmarks/fair_table.py table --trained-on "simulated:2000:train, then 38 KITTI scans" \\
+        --data kitti_odometry --operations 1.55e14 --scans 20
     python benchmarks/fair_table.py ranks
     python benchmarks/fair_table.py plot budgets.png
     python benchmarks/fair_table.py add TABLE      # folder of lidargrit compare

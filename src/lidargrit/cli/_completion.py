@@ -27,9 +27,9 @@ def add_completion(parser: argparse.ArgumentParser, model: str, points_only: boo
     parser.add_argument("out", type=Path, help="folder for the files: empty, or begun by the same command")
     parser.add_argument("--model", default="pretrained", help=model)
     add_count(parser)
-    each = "number of completions of each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
+    each = "number of random results for each scan; several lie in OUT/completion_0, OUT/completion_1, ..."
     parser.add_argument("--samples", type=WholeNumber(1), default=1, help=each)
-    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first completion")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the first result")
     kind = "format of the clouds, a name from: lidargrit list formats (default: that of each scan's file); or image "
     parser.add_argument("--format", default="", help=kind + "for the model's range images alone, as .npy")
     add_scans(parser, "settings of sampling, as sampling.temperature=0.9, and of reading scans, as data.columns=1024")

@@ -93,7 +93,9 @@ class Parser(argparse.ArgumentParser):
 
     def short_usage(self) -> str:
         """Return the words that a command needs, in one line; its options are listed below it."""
-        shown = [str(action.metavar or action.dest).upper() for action in self._actions if not action.option_strings]
+        forms = {"?": "[{}]", "*": "[{} ...]", "+": "{} ..."}
+        words = [action for action in self._actions if not action.option_strings]
+        shown = [forms.get(str(each.nargs), "{}").format(str(each.metavar or each.dest).upper()) for each in words]
         return " ".join([self.prog, *shown, "[OPTION ...]"])
 
     def verbs(self) -> "list[Parser]":

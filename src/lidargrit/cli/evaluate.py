@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     reference = "scans to compare with, projected with the sensor of the samples; or their .lgref"
     add("reference", nargs="?", default="", help=reference)
     add("--protocol", default="exact", metavar="NAME", help="metrics and definitions: lidargrit list protocols")
-    add("--metrics", nargs="+", default=[], metavar="NAME", help="others than its: lidargrit list metrics")
+    add("--metrics", nargs="+", default=[], metavar="NAME", help="others than the protocol's: lidargrit list metrics")
     add("--variant", default="", metavar="NAME", help="published definition of every metric")
     add("--samples-format", default="", metavar="NAME", help="program that wrote them: lidargrit list sample-formats")
     add("--weights", nargs="+", default=[], metavar="NAME=FILE", help="weights of pointnet and rangenet53")
@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scans(parser)
     add("--model", default="", metavar="RUN", help="model of raydrop (streets) or of drives (forecast)")
     add("--beside", default="", metavar="SCANS", help="scans of another real drive, compared too (streets)")
-    kept = "only keep of SAMPLES, real scans, what others score by (.lgref)"
+    kept = "keep what others need to score against SAMPLES, which are real scans (.lgref)"
     add("--save-reference", type=Path, metavar="FILE", help=kept)
     add("--report", type=Path, metavar="FILE", help="also write a page (.html), of streets a picture (.png)")
     add_json(parser, "the files of --json, --report and --save-reference")

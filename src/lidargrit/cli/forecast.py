@@ -1,4 +1,4 @@
-"""Write the next scans of a recorded drive, sampled one after the other; the same command goes on where it stopped."""
+"""Forecast the scans that follow in a recorded drive, one after the other; the same command goes on where it stopped."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Write new scans with a trained run; the same command goes on where it stopped."""
+"""Sample new scans from a trained run; the same command goes on where it stopped."""
 
 import argparse
 import os

@@ -1,4 +1,4 @@
-"""Scans of procedural streets as files, in the layout of KITTI odometry, with labels and poses."""
+"""Simulate scans of streets as files in the layout of KITTI odometry, with labels and poses."""
 
 import argparse
 from pathlib import Path
