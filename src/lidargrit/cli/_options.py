@@ -30,7 +30,7 @@ def add_scans(parser: argparse.ArgumentParser, settings: str = _READING, *, proj
         rows = {"choices": ["sensor", "spherical", "unfolding"], "metavar": "ROWS"}
         add("--projection", help="spherical (elevation), unfolding (ring) or sensor", **rows)
     how = {"metavar": "HOW", "default": None}
-    add("--bad-points", choices=["refuse", "drop"], help="refuse or drop points that are no measurement (NaN, 0 0 0)", **how)
+    add("--bad-points", choices=["refuse", "drop"], help="refuse or drop placeholder points (NaN, 0 0 0)", **how)
     add("--bad-scans", choices=["refuse", "skip"], help="refuse or skip scans that cannot be used", **how)
     add_settings(parser, settings)
 

@@ -1,4 +1,4 @@
-"""Forecast the scans that follow in a recorded drive, one after the other; the same command goes on where it stopped."""
+"""Forecast the scans that follow in a drive, one after the other; the same command goes on where it stopped."""
 
 import argparse
 from pathlib import Path
