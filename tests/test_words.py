@@ -132,6 +132,13 @@ def test_help_tells_the_exit_codes(capsys):
     assert all(f"{code} " in output.partition("exit codes:")[2] for code in (0, 1, 2, 130, 143))
 
 
+def test_usage_shows_which_words_may_be_left_out():
+    usage = {parser.prog.split()[1]: parser.usage for parser in build_parser().verbs()}
+    assert usage["serve"] == "lidargrit serve [RUN ...] [OPTION ...]"
+    assert usage["list"] == "lidargrit list [KIND] [OPTION ...]"
+    assert usage["view"] == "lidargrit view SCANS ... [OPTION ...]"
+
+
 def test_help_of_every_verb_fits_a_page(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     lines = {parser.prog: len(parser.format_help().splitlines()) for parser in build_parser().verbs()}
