@@ -111,8 +111,14 @@ def printable(text: str) -> str:
 
 
 def first_words(error: Exception) -> str:
-    """Return what a library says of an error, in one line of at most 120 letters."""
-    return "".join(filter(str.isprintable, " ".join(str(error).split())))[:120] or type(error).__name__
+    """Return what a library says of an error, in one line of at most 120 letters; of a file's, without its name."""
+    said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    return "".join(filter(str.isprintable, " ".join(said.split())))[:120] or type(error).__name__
+
+
+def kind_and_words(error: Exception) -> str:
+    """Return the class of an error and the first line of what is said of it, which alone may be a bare name."""
+    return f"{type(error).__name__}: {str(error).partition(chr(10))[0][:120]}"
 
 
 def without_folders(text: str, sources: Iterable[str] = ()) -> str:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
-from lidargrit.core.errors import CheckpointError, DataError, LidarGritError, UsageError
+from lidargrit.core.errors import CheckpointError, DataError, LidarGritError, UsageError, first_words
 
 JSON_BYTES_AT_MOST = 64 * 2**20  # the scans of the largest data set, 400,000, take 40 MB; parsed, bytes become tenfold
 TEXT_BYTES_AT_MOST = 2**20  # notes for a model card
@@ -67,7 +67,7 @@ def parse_json(
         why = f"nested more than {JSON_DEPTH_AT_MOST} deep"
         raise error(f"{source}, which cannot be used ({why})", wanted, cure) from None
     except (ValueError, TypeError) as why:
-        raise error(f"{source}, which cannot be used ({_reason(why)})", wanted, cure) from None
+        raise error(f"{source}, which cannot be used ({first_words(why)})", wanted, cure) from None
     return value
 
 
@@ -209,9 +209,3 @@ def _is_deep(value: Any) -> bool:
         if not level:
             return False
     return True
-
-
-def _reason(why: Exception) -> str:
-    if isinstance(why, OSError) and why.strerror:
-        return why.strerror
-    return " ".join(str(why).split())[:120] or type(why).__name__

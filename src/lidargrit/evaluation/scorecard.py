@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lidargrit.core.configuration import hints_of, rebuilt
-from lidargrit.core.errors import DataError
+from lidargrit.core.errors import DataError, kind_and_words
 from lidargrit.core.files import read_json, sha256_of_json
 from lidargrit.core.table import Table
 from lidargrit.evaluation.intervals import Score, format_value
@@ -144,7 +144,7 @@ class Scorecard:
         except DataError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise DataError(f"{path}, which cannot be used ({type(error).__name__}: {error})", wanted, cure) from None
+            raise DataError(f"{path}, which cannot be used ({kind_and_words(error)})", wanted, cure) from None
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> "Scorecard":

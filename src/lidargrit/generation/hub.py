@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from types import ModuleType
 
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.errors import CheckpointError, ConfigError, kind_and_words
 from lidargrit.data.run_folder import WEIGHTS_FILE, named_folder
 
 _WANTED = "a run's folder, or USER/REPOSITORY on the Hugging Face hub"
@@ -49,7 +49,9 @@ def located(
             allow_patterns=["*.json", WEIGHTS_FILE],
         )
     except Exception as error:  # its client has a dozen kinds, from a wrong name to a broken line, and changes them
-        raise CheckpointError(f"{name}, which cannot be fetched ({_told(error)})", _WANTED, "check the name") from None
+        raise CheckpointError(
+            f"{name}, which cannot be fetched ({kind_and_words(error)})", _WANTED, "check the name"
+        ) from None
     return Path(path)
 
 
@@ -74,7 +76,7 @@ def upload(
             repo_id=repo_id, folder_path=folder, commit_message=commit_message, revision=branch, create_pr=create_pr
         )
     except Exception as error:  # as above
-        got, cure = f"{repo_id}, to which nothing was uploaded ({_told(error)})", "log in with: hf auth login"
+        got, cure = f"{repo_id}, to which nothing was uploaded ({kind_and_words(error)})", "log in with: hf auth login"
         raise ConfigError(got, "a repository that you may write to", cure) from None
     return str(commit.commit_url)
 
@@ -87,7 +89,3 @@ def _client(name: str, error: type[CheckpointError] | type[ConfigError]) -> Modu
     except ImportError:
         cure = "install its client: pip install 'lidargrit[hub]'"
         raise error(f"{name}, a repository on the hub", "the hub's client", cure) from None
-
-
-def _told(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).partition(chr(10))[0][:100]}"

@@ -12,7 +12,7 @@ from torch.nn.modules.module import (
     register_module_parameter_registration_hook,
 )
 
-from lidargrit.core.errors import ConfigError
+from lidargrit.core.errors import ConfigError, first_words
 
 NUMBERS_AT_MOST = 2**30  # 4.3 GB in 32 bits, thirty times the largest network of our presets
 _MODULES_AT_MOST = 20_000  # many small ones take minutes to build; the largest networks of our presets have 2,000
@@ -56,8 +56,8 @@ def numbers_at_most(
     except (RuntimeError, MemoryError, OverflowError, TypeError) as error:  # a single tensor that no machine can hold
         if isinstance(error, TypeError) and "Overflow" not in str(error):  # torch's of sizes beyond 64 bits
             raise
-        reason = str(error).partition("\n")[0][:100]
-        raise ConfigError(f"{what} that cannot be built ({reason})", f"at most {count:,} numbers", cure) from None
+        got = f"{what} that cannot be built ({first_words(error)})"
+        raise ConfigError(got, f"at most {count:,} numbers", cure) from None
     finally:
         for hook in hooks:
             hook.remove()

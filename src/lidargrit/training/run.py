@@ -16,7 +16,7 @@ import torch
 
 from lidargrit.core import configuration, reporting
 from lidargrit.core.determinism import derive_seed
-from lidargrit.core.errors import CheckpointError, ConfigError, OutputError
+from lidargrit.core.errors import CheckpointError, ConfigError, OutputError, kind_and_words
 from lidargrit.core.files import claim_folder, claimed_manifest, is_taken, read_json, write_json
 from lidargrit.core.processes import rank_and_world_size
 from lidargrit.core.version import __version__
@@ -236,9 +236,9 @@ def tracked(project: str, preset: Preset, folder: Path) -> Iterator[None]:
     except ImportError:
         raise ConfigError(f"--wandb {project}, and no wandb", wanted, cure) from None
     except Exception as error:  # its client has many kinds, from a missing key to a broken line, and changes them
-        reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0][:100]}"
+        got = f"--wandb {project}, where {kind_and_words(error)}"
         cure = "log in with: wandb login, or set WANDB_MODE=offline"
-        raise ConfigError(f"--wandb {project}, where {reason}", "a project that can be written to", cure) from None
+        raise ConfigError(got, "a project that can be written to", cure) from None
     failed = 1
     try:
         yield

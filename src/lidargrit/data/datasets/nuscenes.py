@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from lidargrit.core.errors import DataError, LidarGritError
+from lidargrit.core.errors import DataError, LidarGritError, first_words
 from lidargrit.core.files import read_json
 from lidargrit.data import formats
 from lidargrit.data.datasets import SplitScheme
@@ -154,9 +154,9 @@ def _read_scenes(root: Path) -> dict[str, list[tuple[int, int, str]]]:
                     span = (min(known), max(known), str(scene["name"]))
                     logs.setdefault(log_files[scene["log_token"]], []).append(span)
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-            what = error.got if isinstance(error, LidarGritError) else " ".join(str(error).split())
+            what = error.got[:200] if isinstance(error, LidarGritError) else first_words(error)
             raise DataError(
-                f"{table.parent}, whose tables cannot be used ({what[:200]})",
+                f"{table.parent}, whose tables cannot be used ({what})",
                 "scene.json, sample.json and log.json as nuScenes has them",
                 "unpack the data set's metadata again, or move that folder away to go by logs",
             ) from None

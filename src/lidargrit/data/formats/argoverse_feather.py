@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.core.errors import DataError, OutputError, ScanError, first_words
 from lidargrit.core.files import atomic_path, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
 from lidargrit.scans.point_times import point_times
@@ -253,9 +253,8 @@ def _columns(path: Path, wanted: tuple[str, ...], data: bytes, may_have: tuple[s
             raise ValueError("empty cells")
         return {name: table[name].to_numpy() for name in wanted}
     except Exception as error:  # the library meets a damaged file with whatever it stumbles over
-        what = " ".join(str(error).split())[:200]
         columns = f"an Arrow feather file with the columns {', '.join(wanted)}"
-        raise ScanError(f"{path}, which cannot be used ({what})", columns, _CURE) from None
+        raise ScanError(f"{path}, which cannot be used ({first_words(error)})", columns, _CURE) from None
 
 
 def _is_number(pa: Any, kind: Any) -> bool:

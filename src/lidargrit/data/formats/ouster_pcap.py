@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidargrit.core.errors import ScanError
+from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import read_json, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, open_file, scan_of
 from lidargrit.data.formats.shared.packets import PCAP, PCAPNG, check_packets, other_maker
@@ -120,8 +120,8 @@ def sensor_of(path: Path) -> SensorModel:
             first_edge_rad=first_edge_rad,
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        what = " ".join(str(error).split())[:200]
-        raise ScanError(f"{metadata}, which is no metadata of an Ouster sensor ({what})", _FORMAT, _CURE) from None
+        got = f"{metadata}, which is no metadata of an Ouster sensor ({first_words(error)})"
+        raise ScanError(got, _FORMAT, _CURE) from None
 
 
 @remembered(lambda path: [path, path.with_suffix(".json")], at_most=2)
@@ -182,5 +182,4 @@ def _section(data: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _unusable(path: Path, error: Exception) -> ScanError:
-    what = " ".join(str(error).split())[:200] or type(error).__name__
-    return ScanError(f"{path}, which cannot be used ({what})", _FORMAT, _CURE)
+    return ScanError(f"{path}, which cannot be used ({first_words(error)})", _FORMAT, _CURE)

@@ -15,7 +15,7 @@ from typing import Any
 
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.errors import CheckpointError, ConfigError, kind_and_words
 from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
 from lidargrit.systems.r2dm.unet import UnetConfig
 
@@ -89,10 +89,7 @@ def read_r2dm_checkpoint(path: Path) -> tuple[UnetConfig, bool, dict[str, Tensor
     except RefusedFileError as why:
         raise CheckpointError(f"{path}, {why}", _WANTED, _CURE) from None
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        reason = str(error).partition("\n")[0][:100]
-        raise CheckpointError(
-            f"{path}, which cannot be read ({type(error).__name__}: {reason})", _WANTED, _CURE
-        ) from None
+        raise CheckpointError(f"{path}, which cannot be read ({kind_and_words(error)})", _WANTED, _CURE) from None
     _check_sizes(path, unet, weights)
     return unet, reflectance, weights
 

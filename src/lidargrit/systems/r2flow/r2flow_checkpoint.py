@@ -15,7 +15,7 @@ from typing import Any
 
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.errors import CheckpointError, ConfigError, kind_and_words
 from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.systems.r2flow.hdit import HditConfig
@@ -47,7 +47,7 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> tuple[HditConfig,
     except CheckpointError:
         raise
     except (KeyError, ValueError, TypeError, ConfigError) as error:
-        message = f"{path}, whose weights are of another network ({type(error).__name__}: {error})"
+        message = f"{path}, whose weights are of another network ({kind_and_words(error)})"
         raise CheckpointError(message, _WANTED, _CURE) from None
     return hdit, channels, steps, weights
 

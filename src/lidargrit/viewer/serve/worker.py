@@ -7,7 +7,6 @@ A job that takes too long, or all memory, ends with this process; the next job s
 import dataclasses
 import json
 import math
-import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -19,7 +18,15 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from lidargrit.core.errors import ConfigError, LidarGritError, OutputError, ScanError, UsageError, one_of
+from lidargrit.core.errors import (
+    ConfigError,
+    LidarGritError,
+    OutputError,
+    ScanError,
+    UsageError,
+    kind_and_words,
+    one_of,
+)
 from lidargrit.core.files import atomic_path, write_text
 from lidargrit.data import formats
 from lidargrit.data.run_folder import locate, projection_variant
@@ -62,7 +69,7 @@ def run_worker(runs: Sequence[Path], device: str) -> None:
         _send(answers, {"refused": [type(error).__name__, error.got, error.wanted, error.cure]})
         return
     except RuntimeError as error:  # most of all where a GPU has no room for them
-        got = f"models that cannot be loaded on the device ({_first_line(error)})"
+        got = f"models that cannot be loaded on the device ({kind_and_words(error)})"
         cure = "name fewer models, or another --device"
         _send(answers, {"refused": ["ConfigError", got, "a device with room for all of them", cure]})
         return
@@ -271,13 +278,9 @@ def _answer_request(model: _Served, request: SampleRequest, folder: Path) -> dic
         return {"error": str(error)}
     except Exception as error:  # the process is to go on, whatever error a network or a library raises
         traceback.print_exc()
-        got = f"an error of the program ({_first_line(error)})"
+        got = f"an error of the program ({kind_and_words(error)})"
         return {"error": str(ConfigError(got, "a result", "try other settings, and report it"))}
     return {"done": True}
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {str(error).partition(os.linesep)[0][:100]}"
 
 
 def _send(answers: TextIO, message: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
-from lidargrit.core.errors import DataError, OutputError, ScanError
+from lidargrit.core.errors import DataError, OutputError, ScanError, first_words
 from lidargrit.core.files import remembered
 from lidargrit.data.datasets.shared.files import FileDataset, hashed_name
 from lidargrit.data.formats import BadPoints
@@ -56,9 +56,8 @@ class LibraryDataset(FileDataset):
 
     @classmethod
     def _unusable(cls, path: Path, error: Exception) -> DataError:
-        what = " ".join(str(error).split())[:200] or type(error).__name__
         cure = "copy it anew, or leave it out"
-        return DataError(f"{path}, which {cls.library} cannot read ({what})", cls.tree, cure)
+        return DataError(f"{path}, which {cls.library} cannot read ({first_words(error)})", cls.tree, cure)
 
     def name(self, index: int) -> str:
         """Name one scan by its drive and its number there."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from lidargrit.core import discovery
 from lidargrit.core.arrays import mapped_member
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import DataError, ScanError
+from lidargrit.core.errors import DataError, ScanError, kind_and_words
 from lidargrit.data import formats
 from lidargrit.data.images import Pixels, Provenance, RangeImages
 from lidargrit.scans.sensors import SensorModel, load_sensor
@@ -47,8 +47,7 @@ def read_tensor(path: Path) -> Tensor:
         if not tensor.is_floating_point():
             raise TypeError(f"numbers of type {tensor.dtype}")
     except Exception as error:  # damaged bytes make torch raise many kinds, for one cause
-        reason = str(error).partition("\n")[0][:120]
-        raise ScanError(f"{path}, which cannot be used ({type(error).__name__}: {reason})", wanted, cure) from None
+        raise ScanError(f"{path}, which cannot be used ({kind_and_words(error)})", wanted, cure) from None
     return tensor.detach().float()
 
 
