@@ -7,7 +7,7 @@ from typing import Any
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, ScanError, printable
 from lidargrit.data.formats import ScanFormat
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.recordings import KINDS, recording_of, write_recording
 from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, ScanIdentity, writable_format
 from lidargrit.data.sources import open_source
@@ -25,7 +25,7 @@ def export_scans(
     source: str,
     out: Path,
     kind: str,
-    config: DataConfig | None = None,
+    config: DataConfig = DEFAULTS,
     sensor: SensorModel | None = None,
     change: Rescan | UndoMotion | None = None,
 ) -> int:
@@ -50,7 +50,6 @@ def export_scans(
     Returns:
         Number of scans, or of recordings, that are there now.
     """
-    config = config or DataConfig()
     others = TREE, *KINDS
     layout = KittiTree(out) if kind in others else _Flat(out, *writable_format(kind, *others))
     scans, of_images = _open(source, config, sensor)

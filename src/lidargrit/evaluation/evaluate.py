@@ -13,7 +13,7 @@ from lidargrit.core.errors import ConfigError, LidarGritError, nearest_names, on
 from lidargrit.core.shares import connected
 from lidargrit.core.untrusted import COUNT_AT_MOST, SEED_AT_MOST
 from lidargrit.core.version import __version__, source_sha256
-from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.prepared.config import NOTHING_NAMED, DataConfig, ScanSettings
 from lidargrit.data.sources import RunSource, Source, open_source
 from lidargrit.evaluation.intervals import Resampling, Score
 from lidargrit.evaluation.metrics import load_metric
@@ -125,7 +125,7 @@ class EvalConfig:
 
 
 def read_config(
-    scans: ScanSettings | None = None,
+    scans: ScanSettings = NOTHING_NAMED,
     *,
     metrics: Sequence[str] = (),
     weights: Sequence[str] = (),
@@ -138,7 +138,6 @@ def read_config(
     Args:
         weights: words such as ``pointnet=FILE``.
     """
-    scans = scans or ScanSettings()
     settings["max_scans"] = settings.get("max_scans") or scans.data.max_scans
     return EvalConfig(
         metrics=tuple(metrics),

@@ -12,7 +12,7 @@ from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import ConfigError, DataError, ScanError, no_usable_scan
 from lidargrit.core.untrusted import seeds_in_a_row
-from lidargrit.data.prepared.config import DataConfig, ScanSettings
+from lidargrit.data.prepared.config import NOTHING_NAMED, DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.data.windows import TimedScan
 from lidargrit.generation.generator import Generator, load
@@ -58,7 +58,7 @@ def load_scan_sets(
     sources: Sequence[str],
     count: int,
     seed: int = 0,
-    settings: ScanSettings | None = None,
+    settings: ScanSettings = NOTHING_NAMED,
     sensor: SensorModel | None = None,
     all_columns: bool = False,
     device: str = "",
@@ -79,7 +79,6 @@ def load_scan_sets(
             with those that its image keeps. Then points without a pixel are shown as well. It has no effect if the
             settings give a number of columns, beside samples and runs, nor with a ``sensor``.
     """
-    settings = settings or ScanSettings()
     config = settings.data
     opened = [open_source(source, config.bad_points) for source in sources]
     runs, chosen = [source for source in opened if isinstance(source, RunSource)], usable_device(device)

@@ -7,7 +7,7 @@ from pathlib import Path
 from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError
 from lidargrit.core.untrusted import PAGE_SCANS_AT_MOST
-from lidargrit.data.prepared.config import ScanSettings
+from lidargrit.data.prepared.config import NOTHING_NAMED, ScanSettings
 from lidargrit.data.sources.scan_sensor import other_sensor
 from lidargrit.generation.generator import load
 from lidargrit.viewer.interactive import write_page
@@ -20,7 +20,7 @@ def view(
     out: Path,
     count: int = 3,
     seed: int = 0,
-    settings: ScanSettings | None = None,
+    settings: ScanSettings = NOTHING_NAMED,
     anomaly_by: str = "",
     device: str = "",
 ) -> None:
@@ -40,10 +40,9 @@ def view(
     rays = None if model is None else model.sensor
     sets = load_scan_sets(sources, count, seed, settings, rays, is_page, device)
     if model is not None:
-        typed = settings.sensor if settings else ""
         for scans in sets:
             if not scans.images.sensor.same_rays(model.sensor):
-                raise other_sensor(scans.images.sensor, model.sensor, anomaly_by, typed)
+                raise other_sensor(scans.images.sensor, model.sensor, anomaly_by, settings.sensor)
         sets = [replace(scans, anomaly=model.bits(scans.images, expected=True).anomaly().cpu()) for scans in sets]
     for scans in sets:
         _tell_hidden(scans, is_page)

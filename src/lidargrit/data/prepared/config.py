@@ -65,6 +65,10 @@ class DataConfig(Settings):
         return sensor if self.projection == "sensor" else replace(sensor, projection=self.projection)
 
 
+DEFAULTS = DataConfig()
+"""How scans are read and projected where nothing is named."""
+
+
 @dataclass(frozen=True)
 class ScanSettings:
     """Settings of reading scans from a command line, the same for all commands.
@@ -99,3 +103,6 @@ class ScanSettings:
     def load_sensor(self) -> SensorModel | None:
         """Return the sensor that is named, with the wanted columns and projection; None if none is named."""
         return self.data.load_sensor() if self.sensor else None
+
+
+NOTHING_NAMED = ScanSettings()

@@ -9,7 +9,7 @@ from lidargrit.core.errors import DataError, LidarGritError, ScanError, no_usabl
 from lidargrit.data.datasets import ScanDataset, data_set_and_split, open_dataset
 from lidargrit.data.formats import BadPoints
 from lidargrit.data.images import Provenance, RangeImages
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.prepared.imaging import ProjectionChoice, choose_projection
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.data.prepared.prepared import PreparedFolder, PreparedImages, is_prepared
@@ -73,9 +73,8 @@ class DatasetSource(Source):
         """Return the source with the first points of each scan alone, which no cache keeps."""
         return CutSource(self, num_points)
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Project the scans once, and find them in the cache from then on."""
-        config = config or DataConfig()
         imaging = self.imaging(sensor, config)
         imaging.report()
         sensor, config = imaging.sensor, imaging.config
@@ -110,9 +109,9 @@ class PreparedSource(Source):
         """Sensor of the images, with all its fine columns."""
         return self._prepared.sensor
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Read the images, with all columns that were prepared, or with fewer if the sensor has fewer."""
-        config, sensor = config or DataConfig(), sensor or self.sensor
+        sensor = sensor or self.sensor
         chosen = self._prepared.evenly_spaced(config.max_scans) if config.max_scans else self._prepared
         store = chosen.on_rays_of(sensor, config.projection_variant)
         if store is not chosen:
@@ -138,9 +137,9 @@ class SampleSource(Source):
         """Sensor of the samples."""
         return self._sensor
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Read the samples, or so many of them, evenly spaced."""
-        return read_samples(self._folder, (config or DataConfig()).max_scans or None)
+        return read_samples(self._folder, config.max_scans or None)
 
 
 class TensorSource(Source):
@@ -162,9 +161,9 @@ class TensorSource(Source):
         """Sensor that the size of the first tensor fits."""
         return sensor_of_tensors(self._folder, self.split)
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Read the samples, or so many of them, evenly spaced."""
-        return read_tensor_folder(self._folder, self.split, (config or DataConfig()).max_scans or None)
+        return read_tensor_folder(self._folder, self.split, config.max_scans or None)
 
 
 class RunSource(Source):
@@ -182,7 +181,7 @@ class RunSource(Source):
         """Sensor of the scans that are generated."""
         return self._sensor
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Refuse: scans have to be generated first."""
         cure = f"generate some first with: lidargrit sample {self.text} FOLDER"
         raise DataError(f"{self.text}, which holds {self.kind}", "scans or samples", cure)
@@ -275,9 +274,9 @@ def open_to_train(sources: Sequence[str], config: DataConfig) -> list[DatasetSou
     return opened
 
 
-def open_images(text: str, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+def open_images(text: str, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
     """Open the range images of one source; see :func:`open_source` and :meth:`Source.images`."""
-    return open_source(text, config.bad_points if config else "refuse").images(sensor, config)
+    return open_source(text, config.bad_points).images(sensor, config)
 
 
 def overlap(source: Source, images: RangeImages | None, reference: Provenance) -> str:

@@ -15,7 +15,7 @@ from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.datasets.shared.files import SENSOR_FILE, is_recognised, scans_below
 from lidargrit.data.formats import read_bytes
 from lidargrit.data.images import Pixels, Provenance, RangeImages
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.sources.source import Source
 from lidargrit.scans.sensors import SensorModel, load_sensor
 
@@ -51,10 +51,10 @@ class ImageFileSource(Source):
             "name it with --sensor NAME or FILE.json, which may have other columns",
         )
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Read the images, which have the rows and columns of the sensor."""
         sensor, count = sensor or self.sensor, len(self._paths)
-        chosen = evenly_spaced((config or DataConfig()).max_scans or count, count)
+        chosen = evenly_spaced(config.max_scans or count, count)
         return RangeImages(sensor, [_ImageFiles([self._paths[index] for index in chosen], sensor)])
 
 

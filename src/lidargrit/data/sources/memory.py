@@ -8,7 +8,7 @@ from lidargrit.core.determinism import evenly_spaced
 from lidargrit.core.errors import DataError
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.images import Pixels, Provenance, RangeImages
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.sources.source import Source
 from lidargrit.scans.projection import project_by_what_fits, projection_that_fits
 from lidargrit.scans.projection.sensor_check import told_doubts
@@ -38,9 +38,8 @@ class MemorySource(Source):
         found.doubts = (_told(self, num_points),)
         return found
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Project the scans, or so many of them, evenly spaced."""
-        config = config or DataConfig()
         self.projection_variant, first, rays = config.projection_variant, self._scans[0], sensor or self.sensor
         found = told_doubts(first, rays, projection_that_fits(first, rays), self.text)
         self.doubts = tuple(dict.fromkeys((*self.doubts, *filter(None, found))))
@@ -66,9 +65,9 @@ class ImagesInMemory(Source):
         """Sensor of the images."""
         return self._batch.sensor
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Return the images, or so many of them, evenly spaced."""
-        chosen = evenly_spaced((config or DataConfig()).max_scans or len(self._batch), len(self._batch))
+        chosen = evenly_spaced(config.max_scans or len(self._batch), len(self._batch))
         return RangeImages(self.sensor, [_Images([self._batch[index] for index in chosen], Provenance())])
 
 
@@ -96,10 +95,9 @@ class CutSource(Source):
         """Return the scans with all their points."""
         return self._source.scans()
 
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Project the first points of the scans, or of so many of them, evenly spaced."""
-        scans, config = self.scans(), config or DataConfig()
-        self.projection_variant = config.projection_variant
+        scans, self.projection_variant = self.scans(), config.projection_variant
         chosen = evenly_spaced(config.max_scans or len(scans), len(scans))
         names, drives = (tuple(of(index) for index in chosen) for of in (scans.name, scans.recording))
         return _imaged(

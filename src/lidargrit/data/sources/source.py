@@ -8,7 +8,7 @@ from typing import ClassVar
 from lidargrit.core.errors import DataError
 from lidargrit.data.datasets import ScanDataset
 from lidargrit.data.images import Provenance, RangeImages
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.run_folder import trained_on
 from lidargrit.scans.sensors import SensorModel
 
@@ -62,7 +62,7 @@ class Source(ABC):
         return replace(config, projection_variant=self.projection_variant or config.projection_variant)
 
     @abstractmethod
-    def images(self, sensor: SensorModel | None = None, config: DataConfig | None = None) -> RangeImages:
+    def images(self, sensor: SensorModel | None = None, config: DataConfig = DEFAULTS) -> RangeImages:
         """Return the range images of the source; pixels are read when they are asked for.
 
         Args:

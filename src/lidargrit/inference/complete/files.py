@@ -17,7 +17,7 @@ from lidargrit.core.determinism import derive_seed, scan_seed
 from lidargrit.core.errors import ConfigError, OutputError
 from lidargrit.core.shares import each_done
 from lidargrit.data.formats import ScanFormat
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.scan_folder import IMAGE, TREE, KittiTree, ScanFolder, check_names, write_array
 from lidargrit.data.sources.image_files import PROBABILITY
 from lidargrit.inference.complete import Model, open_model
@@ -188,7 +188,7 @@ def complete_scans(
     model: Model,
     task: Task,
     output: OutputConfig,
-    config: DataConfig | None = None,
+    config: DataConfig = DEFAULTS,
     *,
     ray: str = "",
     device: str = "",
@@ -210,7 +210,6 @@ def complete_scans(
     Returns:
         what was written, and how many points came in and went out.
     """
-    config = config or DataConfig()
     completion = _Completion.of(source, out, model, task, output, config)
     folder = completion.folder
     jobs = completion.jobs(folder.missing)

@@ -13,7 +13,7 @@ from lidargrit.core import reporting
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.table import Table
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
-from lidargrit.data.prepared.config import DataConfig
+from lidargrit.data.prepared.config import DEFAULTS, DataConfig
 from lidargrit.data.run_folder import locate, weights_sha256
 from lidargrit.data.scan_folder import KittiTree, ScanFolder, write_with_labels
 from lidargrit.data.sources import open_source
@@ -85,7 +85,7 @@ def segment_scans(
     source: str,
     out: Path,
     model: str = "pretrained",
-    config: DataConfig | None = None,
+    config: DataConfig = DEFAULTS,
     device: str = "",
     numbering: str = "",
 ) -> tuple[int, LabelScores | None]:
@@ -103,7 +103,6 @@ def segment_scans(
     Returns:
         number of scans that are there now, and how well their own labels were found, None without a comparison.
     """
-    config = config or DataConfig()
     segmenter = open_segmenter(model, device)
     source_scans = _opened(source, segmenter, config)
     source_scans.check_output(out)

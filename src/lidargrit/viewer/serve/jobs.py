@@ -20,7 +20,7 @@ from typing import Any, Literal
 from lidargrit.core import errors
 from lidargrit.core.errors import DataError, LidarGritError
 from lidargrit.core.processes import module_command
-from lidargrit.viewer.serve.requests import Limits, SampleRequest, SamplingSetting
+from lidargrit.viewer.serve.requests import LIMITS, Limits, SampleRequest, SamplingSetting
 
 State = Literal["waiting", "running", "done", "failed"]
 
@@ -47,9 +47,9 @@ class JobQueue:
         folder: an empty folder for uploads and results; the caller removes it.
     """
 
-    def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits | None = None) -> None:
-        self.limits = limits or Limits()
-        self._folder, self._options = folder, {"runs": [str(run) for run in runs], "device": device}
+    def __init__(self, runs: Sequence[Path], folder: Path, device: str = "", limits: Limits = LIMITS) -> None:
+        self.limits, self._folder = limits, folder
+        self._options = {"runs": [str(run) for run in runs], "device": device}
         self._jobs: dict[str, Job] = {}  # the oldest first
         self._waiting: deque[Job] = deque()
         self._changed = threading.Condition()

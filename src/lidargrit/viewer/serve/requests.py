@@ -56,6 +56,9 @@ class Limits:
     idle_seconds: int = 15
 
 
+LIMITS = Limits()
+
+
 class Example(NamedTuple):
     """A simulated street to try a task on.
 

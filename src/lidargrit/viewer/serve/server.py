@@ -19,7 +19,7 @@ from lidargrit.data.run_folder import PACKAGED, is_bundle, is_run
 from lidargrit.generation.generator import load
 from lidargrit.viewer.serve.application import ALL_ADDRESSES, LOOPBACK_NAMES, Application
 from lidargrit.viewer.serve.jobs import JobQueue
-from lidargrit.viewer.serve.requests import Limits
+from lidargrit.viewer.serve.requests import LIMITS, Limits
 
 _THREADS = 4  # threads that answer requests: each takes milliseconds, because the worker process computes
 _RESPONSE_BYTES = 1 << 30  # more than any response has; all of them are in memory already
@@ -44,7 +44,7 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8000,
     device: str = "",
-    limits: Limits | None = None,
+    limits: Limits = LIMITS,
     opens: bool = False,
 ) -> None:
     """Serve a page to generate, complete, compare and save scans, until Ctrl-C.
@@ -73,13 +73,12 @@ def serve(
 
 @contextlib.contextmanager
 def open_server(
-    runs: Sequence[Path], host: str = "127.0.0.1", port: int = 0, device: str = "", limits: Limits | None = None
+    runs: Sequence[Path], host: str = "127.0.0.1", port: int = 0, device: str = "", limits: Limits = LIMITS
 ) -> Iterator[RunningServer]:
     """Yield a server that listens; at the end of the block it, its worker process and its files are gone.
 
     Args, Raises: as for :func:`serve`.
     """
-    limits = limits or Limits()
     logging.getLogger("waitress.queue").setLevel(logging.ERROR)  # it logs every request that waits
     with (
         contextlib.closing(_listening(host, port)) as bound,
