@@ -16,7 +16,7 @@ from lidargrit.generation.settings import Preset
 from lidargrit.training import training_flops
 
 COSTS = "costs.json"
-_ENTRIES = {  # entry of the file → name and unit in the table; None where it is not known
+HEADS = {  # entry of the file, None where it is not known → name and unit in tables
     "parameters": "parameters (all networks)",
     "training_flops": "training (FLOPs)",
     "flops_per_scan": "sampling (FLOPs/scan)",
@@ -68,7 +68,7 @@ class Costs:
 
     def write_unknown(self) -> None:
         """Write that nothing is known of the costs, as of samples that were there."""
-        write_json(self.path, {"weights_sha256": self.weights_sha256, **dict.fromkeys(_ENTRIES), "scans": 0})
+        write_json(self.path, {"weights_sha256": self.weights_sha256, **dict.fromkeys(HEADS), "scans": 0})
 
     def add_bits(self, generator: Generator, scans: EvalSet) -> None:
         """Add the bits a return of the reference to the file, unless those of the same scans are there."""
@@ -87,7 +87,7 @@ class Costs:
 def read_costs(path: Path) -> dict[str, Any]:
     """Read what :class:`Costs` wrote."""
     of = read_json(path)
-    for name in (*_ENTRIES, "scans"):
+    for name in (*HEADS, "scans"):
         if name not in of or not (type(of[name]) in (int, float) or (of[name] is None and name != "scans")):
             cure = "remove the folder of this system, and compare again"
             raise CheckpointError(f"{path}, whose {name} is no number", "what lidargrit compare wrote", cure)
@@ -99,9 +99,9 @@ def costs_table(files: Sequence[tuple[str, Path]], remarks: Sequence[str] = ()) 
     rows = []
     for name, path in files:
         of = read_costs(path)
-        numbers = [of[entry] for entry in _ENTRIES]
+        numbers = [of[entry] for entry in HEADS]
         rows.append((name, *("" if number is None else _as_text(number) for number in numbers)))
-    return Table(("system", *_ENTRIES.values()), tuple(rows), "Costs", notes=(*_NOTES, *remarks))
+    return Table(("system", *HEADS.values()), tuple(rows), "Costs", notes=(*_NOTES, *remarks))
 
 
 def _as_text(number: int | float) -> str:

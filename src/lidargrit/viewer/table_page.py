@@ -5,20 +5,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lidargrit.core.errors import without_folders
+from lidargrit.evaluation.costs import HEADS
 from lidargrit.evaluation.scorecard import Scorecard
 from lidargrit.evaluation.tables import NamedCard, comparable, judge
 from lidargrit.evaluation.verdict import column_of, notes_on_floors
 from lidargrit.viewer._page import asset, document, part
 from lidargrit.viewer.report_charts import REAL_AGAINST_REAL
-
-_COSTS = {
-    "parameters": "parameters",
-    "training_flops": "operations of training",
-    "flops_per_scan": "operations a scan",
-    "network_evaluations": "network evaluations a scan",
-    "seconds_per_scan": "seconds a scan",
-    "bits_per_return": "bits a return",
-}
 
 
 def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
@@ -42,7 +34,7 @@ def table_page(cells: Sequence[dict[str, Any]], flops: float) -> str:
         apart=len(tables) > 1,
         real_against_real=REAL_AGAINST_REAL,
         tables=[_table(cards, costs) for cards in tables],
-        costs=list(_COSTS.values()),
+        costs=list(HEADS.values()),
     )
     return document(
         f"{_systems(len(cells))} compared", asset("report.css") + asset("table.css"), content, asset("table.js")
@@ -74,7 +66,7 @@ def _table(cards: Sequence[NamedCard], costs: Mapping[str, dict[str, Any]]) -> d
         "columns": columns,
         "higher": {column_of(score) for score in scores if score.result.higher_is_better},
         "rows": [
-            (name, [scored.get(column) for column in columns], [_number(costs[name].get(cost)) for cost in _COSTS])
+            (name, [scored.get(column) for column in columns], [_number(costs[name].get(cost)) for cost in HEADS])
             for (name, _), scored in zip(cards, by_column, strict=True)
         ],
         "real": [real.get(column) for column in columns],
