@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from lidargrit.evaluation.metrics.shared.matching import chamfer_distance
 from lidargrit.scans.sensors import SensorModel
 
 BOX_M = (70.0, 70.0, 4.5)
@@ -103,8 +104,7 @@ def chamfer_m2(one_m: Float64[np.ndarray, "n 3"], other_m: Float64[np.ndarray, "
     """
     if not len(one_m) or not len(other_m):
         return 0.0
-    forth, back = KDTree(other_m).query(one_m)[0], KDTree(one_m).query(other_m)[0]
-    return float(((forth**2).mean() + (back**2).mean()) / 2)
+    return chamfer_distance(one_m, other_m) / 2
 
 
 def gem_errors(forecast_m: Float64[Tensor, "H W"], true_m: Float64[Tensor, "H W"], sensor: SensorModel) -> GemErrors:

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 from scipy.spatial import KDTree
 from torch import Tensor
 
-Cloud = Float32[np.ndarray, "_ 3"]
+Cloud = Float[np.ndarray, "_ 3"]
 Clouds = Float32[np.ndarray, "_ points 3"]
 
 
