@@ -1,8 +1,10 @@
 """What a prepared folder is to hold, and what is known of each image beside its pixels; kept as JSON."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
+
+from lidargrit.core.configuration import hints_of, rebuilt
 
 PLAN_FILE, SCANS_FILE, ARRAYS, MADE_FOLDER = "plan.json", "scans.json", "images.zarr", "made"
 STORED_AS = {"range": "uint16", "reflectance": "uint8", "label": "uint16"}  # the arrays of a store
@@ -40,15 +42,11 @@ class PreparedSpec:
 
     @classmethod
     def from_json(cls, entries: dict[str, Any]) -> "PreparedSpec":
-        """Return the plan that a file holds, or raise TypeError; the sensor checks itself."""
-        names = {one.name for one in fields(cls)}
+        """Return the plan that a file holds, or raise TypeError or ConfigError; the sensor checks itself."""
+        names = hints_of(cls).keys()
         if wrong := sorted(names - entries.keys()) or sorted(entries.keys() - names):
             raise TypeError(f"it {'has' if wrong[0] in entries else 'lacks'} {', '.join(map(ascii, wrong[:3]))}")
-        spec = cls(**entries)
-        for one in fields(cls):
-            kind = {int: int, float: (int, float), str: str}.get(one.type, dict)
-            if not isinstance(getattr(spec, one.name), kind) or isinstance(getattr(spec, one.name), bool):
-                raise TypeError(f"{one.name} is {getattr(spec, one.name)!r:.40}")
+        spec = rebuilt(cls, entries)
         if spec.format != FORMAT or min(spec.shard_scans, spec.num_scans) < 1:
             raise TypeError(f"format {spec.format}, {spec.num_scans} scans by {spec.shard_scans}")
         return spec

@@ -126,8 +126,9 @@ class PreparedFolder:
         entries = self.read_json(PLAN_FILE)
         try:
             return PreparedSpec.from_json(entries)
-        except TypeError as error:
-            got = f"{self.location}/{PLAN_FILE}, which is no plan ({error})"
+        except (TypeError, ConfigError) as error:
+            reason = error.got if isinstance(error, ConfigError) else error
+            got = f"{self.location}/{PLAN_FILE}, which is no plan ({reason})"
             raise DataError(got, "one of this version", "prepare into another folder") from None
 
     def read_made(self, shard: int) -> MadeScans:
