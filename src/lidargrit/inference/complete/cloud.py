@@ -13,6 +13,7 @@ from lidargrit.inference.complete.inputs import InputScan
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.fills import along_rows
 from lidargrit.scans.projection import unproject
+from lidargrit.scans.projection.sensor_check import elevations_deg
 from lidargrit.scans.types import RangeImage, Scan
 
 
@@ -150,20 +151,15 @@ def _rings_of_added(seen: InputScan, added: Scan) -> Int[Tensor, "m"] | None:
     if ring is None or seen.by_ring:
         return added.ring
     numbers, of_point = np.unique(ring.numpy(), return_inverse=True)
-    elevation = _elevations(seen.cloud.points_xyz_m)
+    elevation = elevations_deg(seen.cloud.points_xyz_m)
     of_laser = np.bincount(of_point, elevation) / np.bincount(of_point)
     order = np.argsort(of_laser)
     borders = (of_laser[order][1:] + of_laser[order][:-1]) / 2
-    return torch.from_numpy(numbers[order][np.searchsorted(borders, _elevations(added.points_xyz_m))])
+    return torch.from_numpy(numbers[order][np.searchsorted(borders, elevations_deg(added.points_xyz_m))])
 
 
 def _joined(own: Tensor | None, added: Tensor | None) -> Tensor | None:
     return None if own is None or added is None else torch.cat((own, added.to(own)))
-
-
-def _elevations(points_xyz_m: Tensor) -> Float64[np.ndarray, "n"]:
-    x, y, z = points_xyz_m.double().numpy().T
-    return np.arctan2(z, np.hypot(x, y))
 
 
 def _directions(points_xyz_m: Tensor) -> Float64[np.ndarray, "n 3"]:

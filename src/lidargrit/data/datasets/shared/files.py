@@ -23,6 +23,7 @@ from lidargrit.data.datasets.shared.poses_beside import motion_beside
 from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints, ScanFormat
 from lidargrit.scans.motion import Motion
+from lidargrit.scans.projection.sensor_check import elevations_deg
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 
@@ -39,13 +40,12 @@ def contradicts_hdl64e(path: Path, form: type[ScanFormat]) -> bool:
         form: format of that file.
     """
     try:
-        points_m = form.read(path, 0, _DROP).points_xyz_m.numpy()
+        points_m = form.read(path, 0, _DROP).points_xyz_m
     except ScanError:  # told where it is read
         return False
     if len(points_m) < _POINTS_AT_LEAST:
         return False
-    x, y, z = points_m.T
-    elevation_deg = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    elevation_deg = elevations_deg(points_m)
     above = float((elevation_deg > _HIGHEST_DEG).mean())
     return above > _ABOVE_AT_MOST or float(np.quantile(elevation_deg, 0.01)) > _LOWEST_DEG
 
