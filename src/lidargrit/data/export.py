@@ -13,6 +13,7 @@ from lidargrit.data.scan_folder import TREE, KittiTree, ScanFolder, ScanIdentity
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.image_files import ImageFileSource
 from lidargrit.data.sources.named import ImageScans, NamedScans, named_scans
+from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.rescan import Rescan
 from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import Scan
@@ -111,13 +112,8 @@ class _Recordings:
     def _usable(self, drive: list[int], advance: Callable[[int], None]) -> Iterator[Scan]:
         is_empty = True
         for index in drive:
-            try:
+            with leaving_out(self._config.bad_scans == "skip"):
                 scan = self._read(index)
-            except ScanError as error:
-                if self._config.bad_scans == "refuse":
-                    raise
-                reporting.message(f"left out: {error.as_left_out()}")
-            else:
                 self._scans.tell_notes(scan)
                 is_empty = False
                 yield scan

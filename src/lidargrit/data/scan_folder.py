@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lidargrit.core import discovery, reporting
-from lidargrit.core.errors import DataError, OutputError, ScanError, UnknownNameError, no_usable_scan, one_of
+from lidargrit.core.errors import DataError, OutputError, UnknownNameError, no_usable_scan, one_of
 from lidargrit.core.files import (
     atomic_path,
     claim_folder,
@@ -32,6 +32,7 @@ from lidargrit.data.datasets.shared.labels_beside import label_file
 from lidargrit.data.datasets.shared.odometry import write_motions
 from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.kitti_bin import KittiBin
+from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.motion import Motion
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import Scan
@@ -131,13 +132,10 @@ class ScanFolder:
     @contextmanager
     def leaving_out(self, *indices: int) -> Iterator[None]:
         """Leave files out, with the reason, if their scan turns out to be unusable; or let the refusal through."""
-        try:
+        with leaving_out(self._bad_scans == "skip"):
             yield
-        except ScanError as error:
-            if self._bad_scans == "refuse":
-                raise
-            reporting.message(f"left out: {error.as_left_out()}")
-            self.leave_out(indices)
+            return
+        self.leave_out(indices)
 
     def leave_out(self, indices: Sequence[int]) -> None:
         """Leave files out."""

@@ -1,9 +1,11 @@
 """Many scans that are read when asked for → those of them that can be used, and what is told of them."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
+from lidargrit.core import reporting
 from lidargrit.core.errors import ScanError
 from lidargrit.scans.types import Scan
 
@@ -41,6 +43,17 @@ def untold(notes: Iterable[str], told: set[str]) -> list[str]:
             told.add(kind)
             new.append(note)
     return new
+
+
+@contextmanager
+def leaving_out(skips: bool) -> Iterator[None]:
+    """Report why a scan cannot be used that is refused within the block; let the refusal through if none is skipped."""
+    try:
+        yield
+    except ScanError as error:
+        if not skips:
+            raise
+        reporting.message(f"left out: {error.as_left_out()}")
 
 
 def usable_scans(dataset: ManyScans, indices: Iterable[int], at_most: int = 0) -> tuple[list[Scan], tuple[str, ...]]:

@@ -10,13 +10,14 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import ConfigError, DataError, ScanError, no_usable_scan
+from lidargrit.core.errors import ConfigError, DataError, no_usable_scan
 from lidargrit.core.untrusted import seeds_in_a_row
 from lidargrit.data.prepared.config import NOTHING_NAMED, DataConfig, ScanSettings
 from lidargrit.data.sources import DatasetSource, RunSource, Source, open_source
 from lidargrit.data.windows import TimedScan
 from lidargrit.generation.generator import Generator, load
 from lidargrit.nn.devices import usable_device
+from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.projection import index_map, project
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage, Scan
@@ -156,24 +157,19 @@ def _of_scans(
     sensor, config = imaging.sensor, imaging.config
     images, indices, filled, beside, hidden = [], [], [], [], []
     for index in evenly_spaced(count, len(dataset)):
-        try:
+        with leaving_out(config.bad_scans == "skip"):
             scan = dataset.scan(index)
             image = project(scan, sensor, variant=config.projection_variant)
-        except ScanError as error:
-            if config.bad_scans == "refuse":
-                raise
-            reporting.message(f"left out: {error.as_left_out()}")
-            continue
-        shown = index_map(scan, sensor, variant=config.projection_variant)[:, :: sensor.column_stride]
-        has_pixel = torch.zeros(len(scan), dtype=torch.bool)
-        has_pixel[torch.from_numpy(shown).long()[image.return_mask]] = True
-        images.append(image)
-        indices.append(index)
-        filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
-        without = (~has_pixel).nonzero()[:, 0]
-        shown_too = without[evenly_spaced(_BESIDE_AT_MOST * shows_beside, len(without))]
-        beside.append(replace(scan, rows=None).select(shown_too) if len(shown_too) else None)
-        hidden.append(len(without) - len(shown_too))
+            shown = index_map(scan, sensor, variant=config.projection_variant)[:, :: sensor.column_stride]
+            has_pixel = torch.zeros(len(scan), dtype=torch.bool)
+            has_pixel[torch.from_numpy(shown).long()[image.return_mask]] = True
+            images.append(image)
+            indices.append(index)
+            filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
+            without = (~has_pixel).nonzero()[:, 0]
+            shown_too = without[evenly_spaced(_BESIDE_AT_MOST * shows_beside, len(without))]
+            beside.append(replace(scan, rows=None).select(shown_too) if len(shown_too) else None)
+            hidden.append(len(without) - len(shown_too))
     if not images:
         raise no_usable_scan(source.text)
     marks = torch.stack([torch.zeros_like(images[0].return_mask) if one is None else one for one in filled])

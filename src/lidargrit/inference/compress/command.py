@@ -24,6 +24,7 @@ from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.drives import DrivesOfSource, Place, PlacedScan, past_of
 from lidargrit.inference.compress.points_command import decompress_points, holds_points
 from lidargrit.inference.compress.scan_codec import ScanCodec
+from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.projection import unproject
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.scans.types import RangeImage
@@ -123,15 +124,10 @@ class _Compressor:
     def write(self, folder: Path, indices: Sequence[int]) -> int:
         for index in indices:
             data, returns, image = b"", 0, self._image(index)
-            try:
+            with leaving_out(self._skips):
                 if isinstance(image, ScanError):
                     raise image
                 data, returns = self._compress(index, image), int(image.return_mask.sum())
-            except ScanError as error:
-                if not self._skips:
-                    raise
-                reporting.message(f"left out: {error.as_left_out()}")
-            else:
                 if not self._told and (lost := _not_kept(image)):
                     self._told = True
                     reporting.message(f".lgz keeps no {lost}")

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from lidargrit.core import reporting
-from lidargrit.core.errors import ScanError, UsageError, no_usable_scan
+from lidargrit.core.errors import UsageError, no_usable_scan
 from lidargrit.core.untrusted import STEP_MM_AT_MOST
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
@@ -16,6 +16,7 @@ from lidargrit.data.sources.named import PointScans, named_scans
 from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
 from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.point_codec import Cloud, PointCodec
+from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.types import Scan
 
 _MARK = "points"  # entry of the header by which such a file is known
@@ -44,15 +45,10 @@ def compress_points(source: str, out: Path, step_mm: int, config: DataConfig) ->
         with reporting.progress("compressing", len(scans), len(scans) - len(missing)) as progress:
             for index in missing:
                 data, count = b"", 0
-                try:
+                with leaving_out(config.bad_scans == "skip"):
                     scan = scans.scan(index)
                     scans.tell_notes(scan)
                     data, count = codec.compress(_cloud(scan)), len(scan)
-                except ScanError as error:
-                    if config.bad_scans != "skip":
-                        raise
-                    reporting.message(f"left out: {error.as_left_out()}")
-                else:
                     lost = [word for name, word in _NOT_KEPT if getattr(scan, name) is not None]
                     if lost and not told:
                         reporting.message(f".lgz keeps no {' and no '.join(lost)}")
