@@ -47,7 +47,7 @@ def test_hits_are_those_of_one_mesh(seed, moves):
     first = whole.cast(*rays)
     same(by_part(first, len(scene.standing), objects), kept.cast(*rays))
     assert (first.triangle >= len(scene.standing)).mean() > 0.05
-    finishes = mesh_of(scene, 0.4), Finish.join([scene.standing.finish(), objects.finish()])
+    finishes = mesh_of(scene, 0.4), Finish.join([scene.standing, objects.finish()])
     (behind, light), (behind_kept, light_kept) = (
         tracer.cast_through(*rays, tracer.cast(*rays), Surfaces.of(finish, RaydropModel(), SensorSetup()).passing())
         for tracer, finish in zip((whole, kept), finishes, strict=True)

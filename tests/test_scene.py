@@ -35,7 +35,7 @@ def meshes(scenes):
 
 @pytest.fixture(scope="module")
 def finishes(scenes):
-    return {key: Finish.join([scene.standing.finish(), scene.objects().finish()]) for key, scene in scenes.items()}
+    return {key: Finish.join([scene.standing, scene.objects().finish()]) for key, scene in scenes.items()}
 
 
 @pytest.mark.parametrize("theme", THEMES)

@@ -35,10 +35,6 @@ class Finish:
         """Join several into one, in their order."""
         return cls(*(np.concatenate([getattr(one, field.name) for one in finishes]) for field in fields(cls)))
 
-    def finish(self) -> "Finish":
-        """Return what the triangles are made of, without the triangles."""
-        return Finish(self.material, self.albedo, self.label, self.instance)
-
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Finish):
@@ -149,7 +145,7 @@ class Objects:
     def finish(self) -> Finish:
         """Return what their parts are made of, object after object."""
         if not self.shapes:
-            return Mesh.of(np.zeros((0, 3, 3)), 0, 0.0, 0).finish()
+            return Mesh.of(np.zeros((0, 3, 3)), 0, 0.0, 0)
         material = [shape.material for shape in self.shapes]
         instance = np.repeat(self.instance, [len(parts) for parts in material])
         return Finish(np.concatenate(material), np.concatenate(self.albedo), np.concatenate(self.label), instance)

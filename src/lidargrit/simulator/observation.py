@@ -169,7 +169,7 @@ def observe_scene(
     drives = config.time_s > 0
     mesh = scene.standing if drives else in_reach(scene.standing, poses, elevations_rad, sensor.range_max_m)
     objects = objects_in_reach(scene.objects(config.time_s), poses, sensor.range_max_m)
-    finish = Finish.join([mesh.finish(), objects.finish()])
+    finish = Finish.join([mesh, objects.finish()])
     tracer, surfaces = Tracer(mesh, sensor.range_max_m, objects), Surfaces.of(finish, model, setup, config.wet)
     rays = looked.rays(*poses)
     first = tracer.cast(*rays)
