@@ -37,8 +37,7 @@ def add_fences(
     length = np.hypot(u_m[:, 1] - u_m[:, 0], v_m[:, 1] - v_m[:, 0])
     pitch = rng.uniform(0.12, 0.3, len(length))
     count = np.clip(length / pitch, 2, 90).astype(int)
-    home = owners(count)
-    order = np.arange(len(home)) - np.repeat(np.cumsum(count) - count, count)
+    home, order = owners(count)
     half = (0.5 * rng.uniform(0.25, 0.75, len(length)) * length / count)[home]
     at = (order + 0.5) * (length / count)[home]
     share = np.stack((at - half, at + half), axis=1) / length[home][:, None]

@@ -160,8 +160,7 @@ def _add_windows(builder: MeshBuilder, rng: np.random.Generator, houses: Houses,
     taste = rng.uniform(2.0, 3.4, len(houses.length_m))  # width of a bay
     bays = np.maximum((walls.length[which] / taste[house]).round(), 1).astype(int)
     storeys = np.maximum((houses.height_m / houses.storey_m).round(), 1).astype(int)[house]
-    cell = owners(bays * storeys)
-    order = np.arange(len(cell)) - np.repeat(np.cumsum(bays * storeys) - bays * storeys, bays * storeys)
+    cell, order = owners(bays * storeys)
     bay, storey = order % bays[cell], order // bays[cell]
     wall, home = which[cell], house[cell]
     width, height = walls.length[wall] / bays[cell], houses.height_m[home] / storeys[cell]
@@ -342,7 +341,7 @@ def _add_balconies(builder: MeshBuilder, rng: np.random.Generator, houses: House
     count = len(houses.length_m)
     front = (walls.glazed & (walls.away < _BALCONIES_TO_M))[:count]
     many = np.where(front, rng.poisson(1.6, count), 0)
-    home = owners(many)
+    home, _ = owners(many)
     x = rng.uniform(-0.5, 0.5, len(home)) * np.maximum(houses.length_m[home] - 4.0, 0.5)
     face = -houses.depth_m[home] / 2
     kind = rng.random(len(home))

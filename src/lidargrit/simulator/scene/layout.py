@@ -10,7 +10,7 @@ from lidargrit.simulator.scene.objects import ObjectBatch, Placements
 from lidargrit.simulator.scene.people import make_cyclists, make_walkers
 from lidargrit.simulator.scene.plants import make_hedges
 from lidargrit.simulator.scene.settlement import Settlement, free_spans
-from lidargrit.simulator.scene.shapes import MeshBuilder, rows_of
+from lidargrit.simulator.scene.shapes import MeshBuilder, owners, rows_of
 from lidargrit.simulator.scene.street_plan import StreetPlan
 from lidargrit.simulator.scene.stretches import Stretch
 from lidargrit.simulator.scene.vehicles import make_vehicles, sample_vehicle_kinds
@@ -75,8 +75,7 @@ def _add_lines(
             continue
         line = np.array(lines[kind])
         pieces = np.maximum(np.ceil((line[:, 1] - line[:, 0]) / 5.0), 1).astype(int)  # short ones follow the bends
-        home = np.repeat(np.arange(len(line)), pieces)
-        order = np.arange(len(home)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        home, order = owners(pieces)
         step = ((line[:, 1] - line[:, 0]) / pieces)[home]
         start = line[home, 0] + order * step
         v = line[home, 2]

@@ -9,7 +9,7 @@ from lidargrit.scans import classes
 from lidargrit.simulator import materials
 from lidargrit.simulator.mesh import Shape
 from lidargrit.simulator.scene.objects import ObjectBatch, Placements
-from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, leaves, sweep
+from lidargrit.simulator.scene.shapes import ShapeBuilder, boxes, leaves, owners, sweep
 from lidargrit.simulator.scene.street_plan import StreetPlan
 
 TREES, BUSHES, HEDGES, THICKETS = 30, 20, 6, 8  # shapes of each
@@ -190,8 +190,7 @@ def make_hedges(
     """Make cut hedges that fill boxes of the street, each as several pieces along it."""
     length = u_m[:, 1] - u_m[:, 0]
     pieces = np.maximum(np.ceil(length / 5.5), 1).astype(int)
-    home = np.repeat(np.arange(len(length)), pieces)
-    order = np.arange(len(home)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    home, order = owners(pieces)
     step = (length / pieces)[home]
     green = rng.uniform(0.3, 0.6, len(length))
     size = np.column_stack((step + 0.1, np.abs(v_m[home, 1] - v_m[home, 0]), height_m[home])) / _HEDGE_M

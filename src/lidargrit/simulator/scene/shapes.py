@@ -172,9 +172,10 @@ def leaves(
     return turned
 
 
-def owners(counts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " m"]:
-    """Return 0 counts[0] times, 1 counts[1] times, and so on."""
-    return np.repeat(np.arange(len(counts)), counts)
+def owners(counts: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    """Return 0 counts[0] times, 1 counts[1] times, and so on; and 0, 1, 2, ... for each of them."""
+    owner = np.repeat(np.arange(len(counts)), counts)
+    return owner, np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def rows_of(*columns: int | float | Num[np.ndarray, " n"]) -> Float64[np.ndarray, "n c"]:
