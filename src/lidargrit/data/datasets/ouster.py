@@ -3,7 +3,7 @@
 from contextlib import suppress
 from pathlib import Path
 
-from lidargrit.core.errors import OutputError, ScanError
+from lidargrit.core.errors import ScanError
 from lidargrit.data.datasets.shared.files import FileDataset, hashed_name
 from lidargrit.data.formats import BadPoints, stem
 from lidargrit.data.formats.ouster_pcap import sensor_of
@@ -25,7 +25,6 @@ class Ouster(FileDataset):
     format = "ouster_pcap"
     citation = "none: your recordings"
     patterns = ("*.pcap", "*/*.pcap")
-    examples = ()
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
@@ -45,10 +44,3 @@ class Ouster(FileDataset):
     def recording_of(self, path: Path) -> str:
         """Name a recording by its file."""
         return hashed_name(path.resolve())
-
-    @classmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Refuse: packets are read, not written."""
-        raise OutputError(
-            "an example of Ouster packets", "a layout that can be written", "record some, or take another"
-        )

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import torch
 
-from lidargrit.core.errors import OutputError
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.formats.pandaset_pkl import sensor_poses
 from lidargrit.scans.motion import Motion
@@ -46,8 +45,3 @@ class Pandaset(FileDataset):
         """Name the drive of a file, also where the root is the drive itself."""
         drive = path.resolve().parent.parent.name
         return f"pandaset/{drive}" if drive.isdecimal() else unnamed_recording(path)
-
-    @classmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Refuse: pickled tables are read, not written."""
-        raise OutputError("an example of PandaSet", "a layout that can be written", "download it, or take another")

@@ -62,8 +62,8 @@ class FileDataset(ScanDataset):
     """Name of the files' format; empty where each file tells by its looks."""
     patterns: ClassVar[tuple[str, ...]]
     """Where the files lie, seen from the root; the first pattern that finds any counts."""
-    examples: ClassVar[tuple[str, ...]]
-    """Where :meth:`write_example` puts scan number {index}, by turns."""
+    examples: ClassVar[tuple[str, ...]] = ()
+    """Where :meth:`write_example` puts scan number {index}, by turns; none of files that are read and not written."""
 
     topic: str = ""
     """Topic of recordings whose scans are wanted; empty for that which a format takes."""
@@ -183,6 +183,8 @@ class FileDataset(ScanDataset):
         # Only here: a reader of files needs no simulator.
         from lidargrit.simulator import simulate  # noqa: PLC0415
 
+        if not cls.examples:
+            raise OutputError(f"an example of {cls.title}", "a layout that can be written", "take another")
         for index in range(num_scans):
             path = root / cls.examples[index % len(cls.examples)].format(index=index)
             if path.exists():

@@ -4,7 +4,7 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
-from lidargrit.core.errors import DataError, OutputError, ScanError, first_words
+from lidargrit.core.errors import DataError, ScanError, first_words
 from lidargrit.core.files import remembered
 from lidargrit.data.datasets.shared.files import FileDataset, hashed_name
 from lidargrit.data.formats import BadPoints
@@ -33,7 +33,6 @@ class LibraryDataset(FileDataset):
     """Drives that a library reads, which this program does not install by itself."""
 
     format = ""
-    examples = ()
     library: ClassVar[str]
     """Name of the library in the package index."""
 
@@ -101,11 +100,6 @@ class LibraryDataset(FileDataset):
     @classmethod
     def _pattern_in(cls, root: Path) -> str | None:
         return next((pattern for pattern in cls.patterns if any(root.glob(pattern))), None)
-
-    @classmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Refuse: the library reads here, and writes nothing."""
-        raise OutputError(f"an example of {cls.title}", "a layout that can be written", "take another")
 
 
 @remembered(lambda cls, path: [path], at_most=2)  # scans are read drive by drive
