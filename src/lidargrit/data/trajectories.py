@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from lidargrit.core.errors import DataError
 from lidargrit.core.files import read_text
 from lidargrit.data.datasets.shared.odometry import motions, table
+from lidargrit.scans.motion import as_poses
 from lidargrit.scans.undo_motion import Trajectory
 
 _KITTI_COLUMNS = 12
@@ -39,7 +40,4 @@ def read_trajectory(path: Path) -> Trajectory:
     rows = table(path, 8, _TUM)
     if not bool((np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) < 0.01).all()):
         raise DataError(f"a quaternion of {path} whose length is not 1", _TUM, "restore the file")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
-    return Trajectory(rows[:, 0], poses, str(path))
+    return Trajectory(rows[:, 0], as_poses(Rotation.from_quat(rows[:, 4:]).as_matrix(), rows[:, 1:4]), str(path))

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidargrit.evaluation.metrics.shared.matching import chamfer_distance
+from lidargrit.scans.motion import as_poses
 from lidargrit.scans.sensors import SensorModel
 
 BOX_M = (70.0, 70.0, 4.5)
@@ -166,9 +167,7 @@ def registered(
             break
         ours, theirs = moved_m[near], target_m[np.asarray(partner)[near]]
         turn, *_ = Rotation.align_vectors(theirs - theirs.mean(0), ours - ours.mean(0))
-        step = np.eye(4)
-        step[:3, :3], step[:3, 3] = turn.as_matrix(), theirs.mean(0) - turn.apply(ours.mean(0))
-        found, before = step @ found, now
+        found, before = as_poses(turn.as_matrix(), theirs.mean(0) - turn.apply(ours.mean(0))) @ found, now
         moved_m = source_m @ found[:3, :3].T + found[:3, 3]
     return found
 

@@ -26,7 +26,7 @@ from lidargrit.generation.generator import Generator, SamplingT, load
 from lidargrit.inference.samples import sampling_identity
 from lidargrit.scans.condition import NOTHING, Condition
 from lidargrit.scans.fine_columns import in_fine_columns
-from lidargrit.scans.motion import Motion, transform_between
+from lidargrit.scans.motion import Motion, as_poses, transform_between
 from lidargrit.scans.past import Past
 from lidargrit.scans.projection import project, unproject
 from lidargrit.scans.types import RangeImage, Scan
@@ -101,9 +101,7 @@ def path_of(frames: int, path: Path | None = None) -> Way:
         got = f"{frames} scans, {PERIOD_S:g} s apart, along {path}, which lasts {lasts:.1f} s"
         raise ConfigError(got, "no more than its length", f"take --frames {int(lasts / PERIOD_S) + 1}, or another path")
     turns, places = known.at(times_s)
-    poses = torch.eye(4, dtype=torch.float64).repeat(frames, 1, 1)
-    poses[:, :3, :3], poses[:, :3, 3] = torch.from_numpy(turns.as_matrix()), torch.from_numpy(places)
-    return Way((), [*poses])
+    return Way((), [*torch.from_numpy(as_poses(turns.as_matrix(), places))])
 
 
 def continued(drive: str, generator: Generator[Any, Any], frames: int, after: int | None, constant_speed: bool) -> Way:

@@ -2,7 +2,8 @@
 
 from typing import NamedTuple
 
-from jaxtyping import Float64
+import numpy as np
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 
@@ -29,3 +30,10 @@ def transform_between(then: Float64[Tensor, "4 4"], now: Float64[Tensor, "4 4"])
     products = now[:3, :3, None] * moved[:3, None]  # the inverse of a rotation is its transpose
     moved[:3] = products[0] + products[1] + products[2]
     return moved
+
+
+def as_poses(turns: Float[np.ndarray, "*n 3 3"], places_m: Float[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 4 4"]:
+    """Return poses: the matrices that turn by rotations, and then move by places in metres."""
+    poses = np.zeros((*turns.shape[:-2], 4, 4))
+    poses[..., :3, :3], poses[..., :3, 3], poses[..., 3, 3] = turns, places_m, 1
+    return poses

@@ -12,7 +12,7 @@ from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset
 from lidargrit.data.datasets.shared.odometry import calibrated, table
 from lidargrit.data.datasets.shared.poses_beside import time_beside
-from lidargrit.scans.motion import Motion
+from lidargrit.scans.motion import Motion, as_poses
 
 _CAMERA = "image_00:"
 _SAME_DRIVE = {"0018": "0002"}  # its 4,380 scans come before 0000004391, with which 0002 was published
@@ -110,5 +110,6 @@ def _poses(root: Path, drive: str) -> dict[int, Float64[np.ndarray, "4 4"]]:
     if not len(rows) or not all(file.is_file() for file in files):
         return {}
     pose_from_velo = calibrated(files[0], _CAMERA) @ np.linalg.inv(calibrated(files[1]))
-    last = np.array([[0.0, 0, 0, 1]])
-    return {int(row[0]): np.vstack((row[1:].reshape(3, 4), last)) @ pose_from_velo for row in rows}
+    matrices = rows[:, 1:].reshape(-1, 3, 4)
+    poses = as_poses(matrices[..., :3], matrices[..., 3])
+    return {int(number): pose @ pose_from_velo for number, pose in zip(rows[:, 0], poses, strict=True)}

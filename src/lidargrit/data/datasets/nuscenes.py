@@ -21,7 +21,7 @@ from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
 from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints
-from lidargrit.scans.motion import Motion
+from lidargrit.scans.motion import Motion, as_poses
 
 _TABLE_BYTES_AT_MOST = 50_000_000  # sample.json, the largest, has 9 MB
 _ROW = re.compile(rb"\{[^{}]{1,4096}\}")
@@ -203,6 +203,4 @@ def _rows(table: Path) -> Iterator[dict[str, Any]]:
 
 def _matrix(row: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     w, x, y, z = row["rotation"]
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat((x, y, z, w)).as_matrix(), row["translation"]
-    return matrix
+    return as_poses(Rotation.from_quat((x, y, z, w)).as_matrix(), np.array(row["translation"], np.float64))

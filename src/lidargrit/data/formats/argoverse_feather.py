@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from lidargrit.core.errors import DataError, OutputError, ScanError, first_words
 from lidargrit.core.files import atomic_path, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, first_bytes, read_bytes, scan_of
+from lidargrit.scans.motion import as_poses
 from lidargrit.scans.point_times import point_times
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
@@ -204,10 +205,8 @@ def _sensor_poses(sweeps: Path) -> dict[int, Float64[np.ndarray, "4 4"]]:
     lengths = np.linalg.norm(numbers[:, :4], axis=1)
     if not (np.isfinite(numbers).all() and bool((np.abs(lengths - 1) < _LENGTH_OFF).all())):
         raise DataError(f"{poses}, with a pose that is none", "unit quaternions and places in metres", _CURE)
-    car_from_sensor, found = np.eye(4), np.tile(np.eye(4), (len(numbers), 1, 1))
-    car_from_sensor[:3, :3], car_from_sensor[:3, 3] = own
-    found[:, :3, :3], found[:, :3, 3] = Rotation.from_quat(numbers[:, :4]).as_matrix(), numbers[:, 4:]
-    return dict(zip(columns["timestamp_ns"].tolist(), found @ car_from_sensor, strict=True))
+    found = as_poses(Rotation.from_quat(numbers[:, :4]).as_matrix(), numbers[:, 4:]) @ as_poses(*own)
+    return dict(zip(columns["timestamp_ns"].tolist(), found, strict=True))
 
 
 def _axes_and_origin(pose: Any) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:

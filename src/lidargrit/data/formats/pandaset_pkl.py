@@ -16,6 +16,7 @@ from lidargrit.core.files import read_json, remembered
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, read_bytes
 from lidargrit.data.formats.shared.pandas_pickle import columns_of_table
 from lidargrit.scans.columns import ScanParts, treated_parts
+from lidargrit.scans.motion import as_poses
 from lidargrit.scans.types import Scan
 from lidargrit.scans.undo_motion import Trajectory
 
@@ -108,9 +109,7 @@ def sensor_poses(folder: Path) -> Trajectory:
 def _sensor_from_pose() -> Float64[np.ndarray, "4 4"]:
     """Return the matrix from the axes of the poses to the sensor's, x ahead and y to the left."""
     tilted = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ Rotation.from_euler("xy", _TILT_DEG, True).as_matrix()
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = tilted, -tilted @ _ORIGIN_M
-    return matrix
+    return as_poses(tilted, -tilted @ _ORIGIN_M)
 
 
 _SENSOR_FROM_POSE = _sensor_from_pose()
@@ -142,9 +141,8 @@ def _trajectory(folder: Path) -> Trajectory:
     try:
         poses, times = (read_json(folder / name, list, DataError, _FORMAT, cure) for name in _POSES)
         turns = Rotation.from_quat([[float(one["heading"][key]) for key in "xyzw"] for one in poses]).as_matrix()
-        matrices = np.tile(np.eye(4), (len(poses), 1, 1))
-        matrices[:, :3, :3] = turns
-        matrices[:, :3, 3] = [[float(one["position"][key]) for key in "xyz"] for one in poses]
+        places_m = np.array([[float(one["position"][key]) for key in "xyz"] for one in poses])
+        matrices = as_poses(turns, places_m)
         times_s = np.array([float(time) for time in times])
         if len(times_s) != len(matrices) or not (np.isfinite(matrices).all() and np.isfinite(times_s).all()):
             raise ValueError("as many times as poses, all finite")

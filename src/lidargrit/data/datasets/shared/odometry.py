@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from lidargrit.core.errors import ConfigError, DataError
 from lidargrit.core.files import read_text, remembered, write_text
-from lidargrit.scans.motion import Motion
+from lidargrit.scans.motion import Motion, as_poses
 
 # KITTI's poses are those of its left camera: x right, y down, z forward. Ours sits in the sensor itself.
 _CAMERA_AXES = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
@@ -39,7 +39,7 @@ def motions(sequence: Path) -> tuple[Motion, ...]:
     if bool((np.diff(times_s) <= 0).any()):
         raise DataError(f"times that do not rise in {times}", "rising seconds", "restore the file")
     cameras = table(own if own.exists() else beside, 12, _POSE).reshape(-1, 3, 4)
-    poses = _homogeneous(cameras)
+    poses = as_poses(cameras[..., :3], cameras[..., 3])
     if len(poses):
         camera_from_sensor = calibrated(calibration, "Tr:") if calibration.exists() else np.eye(4)
         poses = np.linalg.inv(camera_from_sensor) @ poses @ camera_from_sensor
@@ -60,12 +60,8 @@ def calibrated(path: Path, name: str = "") -> Float64[np.ndarray, "4 4"]:
     found = _numbers(rows, 12, path, f"a row{told} with {_POSE}")
     if len(found) != 1 or abs(np.linalg.det(found.reshape(3, 4)[:, :3])) < 0.5:  # a rotation has 1
         raise DataError(f"{path} without a pose{told}", "that of one sensor seen from another", "restore the file")
-    return _homogeneous(found.reshape(1, 3, 4))[0]
-
-
-def _homogeneous(poses: Float64[np.ndarray, "n 3 4"]) -> Float64[np.ndarray, "n 4 4"]:
-    last = np.broadcast_to(np.array([0.0, 0, 0, 1]), (len(poses), 1, 4))
-    return np.concatenate((poses, last), 1)
+    pose = found.reshape(3, 4)
+    return as_poses(pose[:, :3], pose[:, 3])
 
 
 def table(path: Path, columns: int, wanted: str) -> Float64[np.ndarray, "n columns"]:
