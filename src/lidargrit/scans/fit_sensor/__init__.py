@@ -171,7 +171,7 @@ def fit_sensor(scans: Sequence[Scan], name: str = "fitted") -> SensorFit:
     row_of_point = tuple(_row_numbers(rows, number) for number in rings.of_point)
     steps = firing_steps_deg(used, row_of_point)
     columns = columns_of_scans(used, row_of_point, steps)
-    sensor = _model(name, rows, columns, used, row_of_point, rings, len(used))
+    sensor = _model(name, rows, columns, used, row_of_point, rings)
     setup, assumed = fit_setup([scans[index] for index in rings.used], sensor)
     sensor = replace(sensor, setup=setup)
     doubts = (*notes_on_sensor(rows, rings), *_warnings(rows, rings, len(scans), columns), *assumed)
@@ -277,7 +277,6 @@ def _model(
     used: Sequence[Points],
     row_of_point: Sequence[Int64[np.ndarray, "_"]],
     rings: Rings,
-    num_scans: int,
 ) -> SensorModel:
     offsets = None
     if rings.lasers:
@@ -293,7 +292,7 @@ def _model(
         range_min_m=NOISE_RANGE_M,
         range_max_m=farthest_m(np.concatenate([points.range_m for points in used])),
         projection=_projection(rows, rings),
-        source=f"lidargrit fit-sensor, from {num_scans} scans (rings: {rings.method})",
+        source=f"lidargrit fit-sensor, from {len(used)} scans (rings: {rings.method})",
         azimuth_offset_rad=None if offsets is None else torch.from_numpy(np.radians(offsets)).float(),
         first_edge_rad=edge_rad,
     )
