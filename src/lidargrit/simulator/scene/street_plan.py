@@ -136,7 +136,7 @@ class StreetPlan:
             here, ahead = self._bent(np.array([0.0, 1.0]), np.full(2, self.our_v_m))
             heading = np.arctan2(*(ahead - here)[::-1])
             object.__setattr__(self, "_origin", (here, float(heading), 0.0))
-            foot_m = float(self.height_m(np.zeros(1), np.array([self.our_v_m]))[0])
+            foot_m = float(self.ground_points(np.zeros(1), np.array([self.our_v_m]))[0, 2])
             object.__setattr__(self, "_origin", (here, float(heading), foot_m))
         start, way = {
             Stretch.FIRST: (0.0, self.speed_m_s * _LOOKS_FOR_S),
@@ -194,10 +194,6 @@ class StreetPlan:
         """Return the points of the ground, at the level of the road, at positions in the street."""
         flat = self._flat(u_m, v_m)
         return np.concatenate((flat, self._height(flat, u_m, v_m)[..., None]), axis=-1)
-
-    def height_m(self, u_m: Num[np.ndarray, "*s"], v_m: Num[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
-        """Return how high the ground, at the level of the road, is over our own wheels."""
-        return self._height(self._flat(u_m, v_m), u_m, v_m)
 
     def poses(
         self,
