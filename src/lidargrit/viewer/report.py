@@ -154,7 +154,7 @@ def _views(both: Mapping[str, Profile]) -> list[Figure]:
     ]
     difference = both["samples"].density - both["reference"].density
     caption = "samples minus reference: red where the samples have more points, blue where the reference has"
-    return [*figures, (difference_picture(difference, float(np.abs(difference).max())), caption, "")]
+    return [*figures, (difference_picture(difference), caption, "")]
 
 
 def _settings(card: Scorecard) -> str:

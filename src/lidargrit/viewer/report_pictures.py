@@ -42,9 +42,10 @@ def density_picture(density: Float[np.ndarray, "x y"], highest: float) -> Pictur
     return _picture(_bytes(colours), (_VIEW, _VIEW))
 
 
-def difference_picture(difference: Float[np.ndarray, "x y"], largest: float) -> Picture:
+def difference_picture(difference: Float[np.ndarray, "x y"]) -> Picture:
     """Render a difference of densities: red where the first is denser, blue where the second is."""
-    scaled = np.sign(difference) * (np.abs(difference) / max(largest, 1e-9)).clip(0, 1) ** 0.4
+    size = np.abs(difference)
+    scaled = np.sign(difference) * (size / max(float(size.max()), 1e-9)) ** 0.4
     return _picture(_bytes(colormaps["RdBu_r"](Normalize(-1, 1)(_upright(scaled)))[..., :3]), (_VIEW, _VIEW))
 
 
