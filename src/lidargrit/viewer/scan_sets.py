@@ -163,12 +163,14 @@ def _of_scans(
             shown = index_map(scan, sensor, variant=config.projection_variant)[:, :: sensor.column_stride]
             has_pixel = torch.zeros(len(scan), dtype=torch.bool)
             has_pixel[torch.from_numpy(shown).long()[image.return_mask]] = True
-            images.append(image)
-            indices.append(index)
-            filled.append(None if scan.filled is None else _of_pixels(scan.filled, shown))
+            marked = None if scan.filled is None else _of_pixels(scan.filled, shown)
             without = (~has_pixel).nonzero()[:, 0]
             shown_too = without[evenly_spaced(_BESIDE_AT_MOST * shows_beside, len(without))]
-            beside.append(replace(scan, rows=None).select(shown_too) if len(shown_too) else None)
+            others = replace(scan, rows=None).select(shown_too) if len(shown_too) else None
+            images.append(image)  # all lists or, if anything above refuses the scan, none
+            indices.append(index)
+            filled.append(marked)
+            beside.append(others)
             hidden.append(len(without) - len(shown_too))
     if not images:
         raise no_usable_scan(source.text)
