@@ -283,6 +283,7 @@ def test_its_cost_counts_every_phase():
     cost, before = generator.cost(), generator.cost(TokenSampling(mask="threshold"))
     assert cost.network_evaluations == before.network_evaluations + 20
     assert cost.flops > before.flops == made(None).cost().flops
+    assert made(None).cost().network_evaluations == math.prod(generator.tokenizer.grid_size) + 1
 
 
 def test_all_of_it_is_trained_saved_and_read_again(tmp_path):

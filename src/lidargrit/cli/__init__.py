@@ -141,9 +141,9 @@ def build_parser(verb: str = "") -> Parser:
     how = "print a script by which this shell completes verbs, options and names, see docs/how-to/from-programs.md"
     parser.add_argument("--print-completion", choices=SHELLS, default="", help=how)
     verbs = parser.add_subparsers(title="verbs", metavar="", dest="verb", prog="lidargrit")
-    modules = _modules_of_verbs()
-    for word in [verb] if verb else modules:
-        name = modules[word]
+    for word, name in _modules_of_verbs().items():
+        if verb not in ("", word):
+            continue
         module = importlib.import_module(f"lidargrit.cli.{name}")
         sub = verbs.add_parser(
             word,

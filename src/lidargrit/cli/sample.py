@@ -37,6 +37,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.core.processes import rank_and_world_size
     from lidargrit.data.run_folder import locate
     from lidargrit.generation.generator import load
+    from lidargrit.inference.drives import opening_of, path_of, write_drives
     from lidargrit.inference.samples import write_samples, write_samples_on_ray
 
     seeds, job = seeds_in_a_row(options.seed, options.count), "drive" if options.frames else "sample"
@@ -49,11 +50,10 @@ def run(options: argparse.Namespace) -> None:
         run_folder, device = locate(options.run_folder, job), options.device or own
         generator, seeds = load(run_folder, device=device), seeds[rank::world_size]
         generator = generator.for_sensor(sensor or generator.sensor)
-        sampling, way = generator.parse_sampling(words), (options.frames, options.path)
+        sampling = generator.parse_sampling(words)
         if options.frames:
-            from lidargrit.inference.drives import opening_of, path_of, write_drives
-
-            first, ways = opening_of(options.run_folder, device), [path_of(*way)] * len(seeds)
+            first = opening_of(options.run_folder, device)
+            ways = [path_of(options.frames, options.path)] * len(seeds)
             write_drives(generator, run_folder, options.out, ways, seeds, sampling, first, path=str(options.path))
         else:
             write_samples(generator, run_folder, options.out, seeds, sampling)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from lidargrit.scans.motion import as_poses
 from lidargrit.simulator.mesh import Mesh, Objects
 from lidargrit.simulator.scene.objects import ObjectBatch
 from lidargrit.simulator.scene.parts import lay_out_first
@@ -68,10 +69,7 @@ class Scene:
         left -= forward * (left @ forward)
         left /= np.linalg.norm(left)
         up = np.cross(forward, left)
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack((forward, left, up), axis=1)
-        pose[:3, 3] = here.xyz_m[0] + height_m * up
-        return pose
+        return as_poses(np.stack((forward, left, up), axis=1), here.xyz_m[0] + height_m * up)
 
     def in_drive(self, pose: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
         """Return a pose of this scene in the world in which its drive begins."""
