@@ -212,6 +212,8 @@ def test_a_batch_is_of_one_sensor_and_each_image_comes_once() -> None:
     resumed = [one.images.range_m for one in batches.stream(4, 20)]
     assert all(map(torch.equal, resumed, [one.range_m for one in seen[2:]]))
     assert images.alike([0, 1, 2, 5, 6], 2) == [[0, 1], [2], [5, 6]]
+    assert images.of_each_sensor() == [range(4), range(4, 10)]
+    assert RangeImages.joined(None, [parts[0], *parts]).of_each_sensor() == [range(8), range(8, 14)]
     labelled = [RangeImages(sensor, [LabelledImages(sensor, 4)]) for sensor in (EVEN, ODD)]
     pasting = Batches(RangeImages.joined(None, labelled), 2, ("paste",), any_columns=False, seed=3)
     pasted = [batch.images for batch in pasting.stream(0, 8)]

@@ -67,7 +67,7 @@ class Batches:
         self.workers, self._condition_of, self._with_keys = workers, condition_of, with_keys
         self._pasts = Pasts(images, past_scans) if past_scans else None
         self._epoch, self._order = -1, torch.empty(0)
-        self._by_sensor = images.alike(range(len(images)), len(images))
+        self._by_sensor = images.of_each_sensor()
         self._epoch_length = len(images)
         if len(self._by_sensor) > 1:
             self._epoch_length = sum(len(each) // batch_size * batch_size for each in self._by_sensor)
@@ -137,6 +137,6 @@ class Batches:
             return torch.randperm(len(self.images), generator=rng)
         batches: list[Tensor] = []
         for each in self._by_sensor:
-            shuffled = torch.tensor(each)[torch.randperm(len(each), generator=rng)]
+            shuffled = torch.arange(each.start, each.stop)[torch.randperm(len(each), generator=rng)]
             batches += [some for some in shuffled.split(self.batch_size) if len(some) == self.batch_size]
         return torch.cat([batches[number] for number in torch.randperm(len(batches), generator=rng).tolist()])

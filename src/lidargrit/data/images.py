@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from functools import cached_property
-from itertools import accumulate, chain
+from itertools import accumulate, chain, pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -138,6 +138,14 @@ class RangeImages:
     def sensor_of(self, index: int) -> SensorModel:
         """Return the sensor of an image."""
         return self._sensors[bisect_right(self._ends, index)]
+
+    def of_each_sensor(self) -> list[range]:
+        """Return the numbers of the images that follow one another and have one sensor."""
+        runs: list[range] = []
+        for number, (start, end) in enumerate(pairwise([0, *self._ends])):
+            goes_on = number and self._sensors[number] is self._sensors[number - 1]
+            runs.append(range(runs.pop().start if goes_on else start, end))
+        return runs
 
     def alike(self, indices: Sequence[int], at_most: int) -> list[list[int]]:
         """Divide indices into batches, in their order, of images of one sensor each.
