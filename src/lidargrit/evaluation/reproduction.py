@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from lidargrit.core.errors import ConfigError
 from lidargrit.data.run_folder import is_run
 from lidargrit.data.sources import load_range_images, open_source
@@ -176,7 +178,9 @@ def plan(wanted: Reproduction, folder: Path) -> dict[str, Any]:
     systems = {}
     for system, preset in presets.items():
         run = folder / "runs" / system
-        generator = preset.build_generator()
+        sensor = preset.data.load_sensor()
+        with torch.device("meta"):  # sizes alone, without values
+            generator = preset.build_generator(sensor)
         systems[system] = {
             "state": "finished" if is_run(run) else "begun" if run.exists() else "to do",
             "plan": plan_training(preset).to_json(),
