@@ -66,10 +66,8 @@ class ShapeBuilder:
         self._parts: list[np.ndarray] = []
 
     def add(self, part: int, triangles_m: Num[np.ndarray, "*lead 3 3"]) -> None:
-        """Add triangles to a part; what has no area is left out."""
+        """Add triangles to a part."""
         flat = np.asarray(triangles_m, np.float32).reshape(-1, 3, 3)
-        normal = np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
-        flat = flat[np.linalg.norm(normal, axis=1) > 1e-7]
         self._triangles.append(flat)
         self._parts.append(np.full(len(flat), part, np.uint8))
 
@@ -78,8 +76,11 @@ class ShapeBuilder:
         self.add(part, boxes(np.array(low_m), np.array(high_m)))
 
     def build(self) -> Shape:
-        """Return the shape."""
-        return Shape(np.concatenate(self._triangles), np.concatenate(self._parts), self._materials)
+        """Return the shape; triangles without area are left out."""
+        triangles, parts = np.concatenate(self._triangles), np.concatenate(self._parts)
+        normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        has_area = np.linalg.norm(normal, axis=1) > 1e-7
+        return Shape(triangles[has_area], parts[has_area], self._materials)
 
 
 def boxes(low_m: Num[np.ndarray, "*lead 3"], high_m: Num[np.ndarray, "*lead 3"]) -> Float32[np.ndarray, "*lead 12 3 3"]:
