@@ -240,6 +240,8 @@ def test_a_value_beyond_the_far_limit_is_cut_to_it_and_keeps_its_return(name):
         (lambda c: c["ema_weights"].pop("denoiser.in_conv.bias"), "lacks 'in_conv.bias'"),
         (lambda c: c["ema_weights"].update({"denoiser.new": torch.ones(1)}), "has besides 'new'"),
         (lambda c: c.pop("ema_weights"), r"cannot be read \(KeyError: 'ema_weights'\)"),
+        (lambda c: c["cfg"].update(model_base_channels=torch.inf), r"cannot be read \(OverflowError: "),
+        (lambda c: c["cfg"].update(train_reflectance=torch.ones(2)), r"cannot be read \(RuntimeError: "),
     ],
 )
 def test_weights_of_another_form_are_refused(tmp_path, change, text):

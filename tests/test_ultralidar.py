@@ -44,8 +44,9 @@ def made(config=TINY):
 )
 def test_presets_have_the_published_sizes(preset, autoencoder, prior):
     preset = load_preset(preset)
+    sensor = preset.data.load_sensor()
     with torch.device("meta"):
-        generator = UltraLidar(preset.model, preset.data.load_sensor())
+        generator = UltraLidar(preset.model, sensor)
     assert sum(weight.numel() for weight in generator.autoencoder.parameters()) == autoencoder
     assert sum(weight.numel() for weight in generator.prior.parameters()) == prior
 
@@ -136,6 +137,11 @@ def test_codes_of_empty_space_are_not_sampled_at_first():
     some = float((generated(blank_steps=3) == 3).float().mean())
     assert 0.5 < some < 0.95
     assert not bool((generated(blank_steps=8) == 3).any())
+
+
+def test_a_single_token_is_sampled_too():
+    whole = replace(TINY, autoencoder=replace(TINY.autoencoder, patch=32))
+    assert UltraLidar(whole, SENSOR).sample([0], sampling=QUICK).range_m.shape == (1, SENSOR.height, SENSOR.width)
 
 
 def test_its_own_voxels_are_those_of_its_images():

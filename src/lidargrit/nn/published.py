@@ -3,7 +3,8 @@
 import io
 import warnings
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,28 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError
+from lidargrit.core.errors import CheckpointError, ConfigError, kind_and_words
 
 _ZIP, _PICKLE = b"PK\x03\x04", b"\x80"  # how files of torch.save begin: since version 1.6, and before it
 
 
 class RefusedFileError(Exception):
     """Reason why a file is not read; it follows the file's name in a sentence."""
+
+
+@contextmanager
+def refused_as(path: Path, wanted: str, cure: str = "check which program saved it") -> Iterator[None]:
+    """Tell in one line why a checkpoint of another program cannot be used, whatever it holds in place of weights."""
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except (RefusedFileError, OSError) as why:
+        raise CheckpointError(f"{path}, {why}", wanted, cure) from None
+    except ConfigError as error:
+        raise CheckpointError(f"{path}, in which {error.got}", error.wanted, cure) from None
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}, which cannot be read ({kind_and_words(error)})", wanted, cure) from None
 
 
 def read_checkpoint(
@@ -28,7 +44,8 @@ def read_checkpoint(
     Args:
         names: names that lead to the weights, such as ``("G_ema",)``; nothing else in the file is read.
     """
-    try:
+    where = f"at {'.'.join(names)!r}" if names else "by name"
+    with refused_as(path, f"a checkpoint with weights {where}", "check the path"):
         found = read_everything(path, bytes_at_most)
         for name in names:
             if not isinstance(found, dict) or name not in found:
@@ -37,9 +54,6 @@ def read_checkpoint(
         if isinstance(found, dict):
             found = {name: of for name, of in found.items() if not any(fnmatchcase(str(name), p) for p in ignored)}
         return float_tensors(found, bytes_at_most)
-    except (RefusedFileError, OSError) as why:
-        where = f"at {'.'.join(names)!r}" if names else "by name"
-        raise CheckpointError(f"{path}, {why}", f"a checkpoint with weights {where}", "check the path") from None
 
 
 def read_everything(path: Path, bytes_at_most: int) -> Any:

@@ -12,8 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError
-from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
+from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything, refused_as
 from lidargrit.systems.lidargen.score_matching import sigma_table
 
 _BYTES_AT_MOST = 1 << 30  # weights, their average and the optimiser's two moments take half a gigabyte
@@ -28,7 +27,7 @@ def read_lidargen_checkpoint(path: Path) -> tuple[int, int, Tensor, dict[str, Te
         number of channels of the finest level, and of an image; noise levels, the largest first; and the moving average
         of the weights, under the names of lidargrit.systems.lidargen.ncsn.
     """
-    try:
+    with refused_as(path, "a checkpoint of LiDARGen's authors or of their program"):
         parts = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(parts, (list, tuple)) or len(parts) != _PARTS:
             raise RefusedFileError(f"which holds no list of {_PARTS} parts")
@@ -41,10 +40,6 @@ def read_lidargen_checkpoint(path: Path) -> tuple[int, int, Tensor, dict[str, Te
             if name not in weights or weights[name].ndim != 4:
                 raise RefusedFileError(f"whose moving average holds no convolution {name!r}")
         _refuse_other_levels(sigmas)
-    except (OSError, RefusedFileError) as why:
-        raise CheckpointError(
-            f"{path}, {why}", "a checkpoint of LiDARGen's authors or of their program", "check which program saved it"
-        ) from None
     return (len(weights["begin_conv.weight"]), len(weights["end_conv.weight"]), sigmas, weights)
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError, ConfigError, kind_and_words
-from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
+from lidargrit.core.errors import CheckpointError
+from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything, refused_as
 from lidargrit.systems.r2dm.unet import UnetConfig
 
 _BYTES_AT_MOST = 1 << 30  # the published files, with optimiser and average, take half a gigabyte
@@ -56,7 +56,7 @@ def read_r2dm_checkpoint(path: Path) -> tuple[UnetConfig, bool, dict[str, Tensor
         sizes of the network; whether it generates reflectance beside the range; and the moving average of the weights,
         under the names of lidargrit.systems.r2dm.unet.
     """
-    try:
+    with refused_as(path, _WANTED, _CURE):
         file = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(file, dict):
             raise RefusedFileError("which holds no values by name")
@@ -82,14 +82,6 @@ def read_r2dm_checkpoint(path: Path) -> tuple[UnetConfig, bool, dict[str, Tensor
         }
         weights = float_tensors(weights, _BYTES_AT_MOST)
         reflectance = bool(settings["data.train_reflectance"]) if "data.train_reflectance" in settings else True
-    except ConfigError as error:
-        raise CheckpointError(f"{path}, in which {error.got}", error.wanted, "check which program saved it") from None
-    except CheckpointError:
-        raise
-    except RefusedFileError as why:
-        raise CheckpointError(f"{path}, {why}", _WANTED, _CURE) from None
-    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CheckpointError(f"{path}, which cannot be read ({kind_and_words(error)})", _WANTED, _CURE) from None
     _check_sizes(path, unet, weights)
     return unet, reflectance, weights
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError, ConfigError, kind_and_words
-from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
+from lidargrit.core.errors import CheckpointError
+from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything, refused_as
 from lidargrit.scans.sensors import SensorModel
 from lidargrit.systems.r2flow.hdit import HditConfig
 
@@ -35,20 +35,13 @@ def read_r2flow_checkpoint(path: Path, sensor: SensorModel) -> tuple[HditConfig,
         sizes of the network; number of channels of an image; number of equal steps that the flow was distilled to, 0 if
         it was not; and the moving average of the weights, under the names of lidargrit.systems.r2flow.hdit.
     """
-    try:
+    with refused_as(path, _WANTED, _CURE):
         file = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(file, dict) or "weights" not in file:
             raise RefusedFileError("which holds no 'weights'")
         steps = _distilled_steps(path, file.get("cfg"), sensor)
         weights = float_tensors(file["weights"], _BYTES_AT_MOST)
         hdit, channels = _sizes(weights)
-    except (RefusedFileError, OSError) as why:
-        raise CheckpointError(f"{path}, {why}", _WANTED, _CURE) from None
-    except CheckpointError:
-        raise
-    except (KeyError, ValueError, TypeError, ConfigError) as error:
-        message = f"{path}, whose weights are of another network ({kind_and_words(error)})"
-        raise CheckpointError(message, _WANTED, _CURE) from None
     return hdit, channels, steps, weights
 
 

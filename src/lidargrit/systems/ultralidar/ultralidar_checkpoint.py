@@ -13,8 +13,8 @@ from pathlib import Path
 
 from torch import Tensor
 
-from lidargrit.core.errors import CheckpointError, ConfigError
-from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything
+from lidargrit.core.errors import CheckpointError
+from lidargrit.nn.published import RefusedFileError, float_tensors, read_everything, refused_as
 from lidargrit.systems.ultralidar.swin import SwinConfig
 from lidargrit.systems.ultralidar.voxel_autoencoder import VoxelAutoencoderConfig
 
@@ -43,7 +43,7 @@ def read_ultralidar_checkpoint(
     Args:
         sizes: cells of the model, which the file does not tell.
     """
-    try:
+    with refused_as(path, "a checkpoint of UltraLiDAR's program"):
         file = read_everything(path, _BYTES_AT_MOST)
         if not isinstance(file, dict) or not isinstance(file.get("state_dict"), dict):
             raise RefusedFileError("which holds no 'state_dict'")
@@ -68,11 +68,6 @@ def read_ultralidar_checkpoint(
                 "set model.autoencoder.grid.cells to those of the file",
             )
         return autoencoder, _blocks(weights, "prior"), weights
-    except (OSError, RefusedFileError, ConfigError) as why:
-        reason = f"whose sizes cannot be: {why.got}" if isinstance(why, ConfigError) else why
-        raise CheckpointError(
-            f"{path}, {reason}", "a checkpoint of UltraLiDAR's program", "check which program saved it"
-        ) from None
 
 
 def of_ours(name: str) -> str:

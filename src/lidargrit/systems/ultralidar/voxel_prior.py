@@ -25,9 +25,6 @@ _FORBIDDEN = -10_000.0  # logit of a code that may not be sampled
 _SMOOTHING = 0.1  # of the labels
 _STEPS_AT_MOST = 1000
 
-Fill = Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]]
-"""Logits of every token → a sampled token each."""
-
 
 @dataclass(frozen=True)
 class FillSampling(SamplingSettings):
@@ -94,12 +91,12 @@ def hidden_token_loss(
 
 
 def number_hidden(length: int, progress: float) -> int:
-    """Return how many of ``length`` tokens are hidden after a share ``progress`` of all passes: at least 1.
+    """Return how many of ``length`` tokens are hidden after a share ``progress`` of all passes: at least 1 of several.
 
     Source:
         Chang et al., MaskGIT, 2022, section 3.3: the cosine schedule.
     """
-    return int(max(1.0, min(length * math.cos(math.pi / 2 * progress), length - 1)))
+    return int(min(max(1.0, length * math.cos(math.pi / 2 * progress)), length - 1))
 
 
 def likeliest_codes(logits: Float[Tensor, "B T K"], share: float) -> Int[Tensor, "B blank"]:
@@ -140,22 +137,20 @@ def hide_unsure(
 def generate_tokens(
     logits_of: Callable[[Int[Tensor, "B T"], Bool[Tensor, "B T"]], Float[Tensor, "B T K"]],
     start: Int[Tensor, "B T"],
-    fill: Fill,
+    fill: Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]],
     gumbel: Callable[[], Float[Tensor, "B T"]],
     sampling: FillSampling,
-    blank: Int[Tensor, "B blank"] | None = None,
 ) -> Int[Tensor, "B T"]:
     """Sample all tokens of new scans, in passes that show more and more of them.
 
     Args:
         logits_of: the transformer: tokens, and which of them are hidden → logits.
         start: tokens of any value, all of which are hidden at first.
-        fill: sampler of tokens.
+        fill: sampler of tokens: logits of every token → a token each.
         gumbel: source of noise of Gumbel's distribution.
         sampling: number of passes, and how they are made.
-        blank: codes that stand for empty space; by default the likeliest of the first pass.
     """
-    tokens, hidden = start, torch.ones_like(start, dtype=torch.bool)
+    tokens, hidden, blank = start, torch.ones_like(start, dtype=torch.bool), None
     for done in range(1, sampling.steps + 1):
         logits = logits_of(tokens, hidden)
         if blank is None:
