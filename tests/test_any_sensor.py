@@ -175,6 +175,12 @@ def test_a_decoder_behind_a_tokenizer_has_no_absent_rows() -> None:
         PixelDecoder(CONFIG, ODD, features=4)
 
 
+def test_a_model_of_one_sensor_does_not_learn_from_others(tmp_path, capsys) -> None:
+    sources = 'data.train=["simulated:4@vlp16:train","simulated:4@hdl32e:train"]'
+    assert main(["train", "marginal", str(tmp_path / "run"), "--set", "data.own_sensors=true", sources]) == 2
+    assert "own_sensors=true for 'marginal', whose networks know the rays of one sensor" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("sensor", [EVEN, ODD], ids=["cells of 16", "cells of 8"])
 def test_phases_of_other_sensors_leave_the_numbers_of_a_mask_uniform(sensor: SensorModel) -> None:
     mask = random_decoder(EVEN).for_sensor(sensor).mask

@@ -8,21 +8,32 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, final
 
 import torch
-from torch import Tensor
 
 from lidargrit.core import configuration, discovery
 from lidargrit.core.errors import CheckpointError, ConfigError
+from lidargrit.core.files import read_tensors
 from lidargrit.data.images import RangeImages
-from lidargrit.data.run_folder import Job, is_bundle, locate, named_folder
+from lidargrit.data.run_folder import (
+    CONFIG_FILE,
+    WEIGHTS_FILE,
+    Job,
+    is_bundle,
+    locate,
+    named_folder,
+    read_config,
+    told_of,
+)
 from lidargrit.generation.batches import BatchSeeds, check_condition, check_images, check_seeds, in_batches, one_by_one
 from lidargrit.generation.facts import CAPABILITIES, Cost, SamplingSettings, SystemFacts
 from lidargrit.generation.hub import located
 from lidargrit.generation.objective import Objective
 from lidargrit.generation.range_steps import RangeSteps
-from lidargrit.generation.saved import Bundle, ConfigT, SavedModel, read_saved
+from lidargrit.generation.saved import Bundle, ConfigT, SavedModel
 from lidargrit.generation.tokenizers import Tokenizer
 from lidargrit.nn.devices import usable_device
 from lidargrit.nn.precision import Precision, inference
+from lidargrit.nn.quantization import without_quantized
+from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.bits import ScanBits
 from lidargrit.scans.condition import NOTHING, Condition, ConditionKind, Nothing, Observed
 from lidargrit.scans.past import Past
@@ -66,9 +77,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     A stage takes place if its networks are there. The objective may be the network itself.
     """
-
-    published_files: ClassVar[tuple[str, ...]] = ()
-    """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 
     @classmethod
     @abstractmethod
@@ -333,18 +341,6 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return cls.facts.lines(cls.capabilities, configuration.own_first(cls.Sampling()), cls.not_of_sampling)
 
     @classmethod
-    def read_published(
-        cls, files: Sequence[Path], config: ConfigT, sensor: SensorModel
-    ) -> tuple[ConfigT, dict[str, dict[str, Tensor]]]:
-        """Read the configuration and the weights in published files; see :meth:`from_published`."""
-        able = [name for name in discovery.names("generators") if load_class(name).published_files]
-        raise ConfigError(
-            f"a generator {cls.public_name()!r}, of which nobody published weights",
-            f"a preset of {', '.join(able)}",
-            "see which generator a preset has with: lidargrit train PRESET OUT --dry-run",
-        )
-
-    @classmethod
     def from_pretrained(
         cls,
         pretrained_model_name_or_path: str | Path,
@@ -382,8 +378,17 @@ def load(name: str | Path, job: Job = "sample", device: str = "cpu") -> Generato
         CheckpointError: no finished model in the folder, a damaged file, or weights of another configuration.
         ConfigError: no such device.
     """
-    there, bundle = usable_device(device), named_folder(name)
-    generator = read_saved(locate(name, job), load_class).to(there)
+    there, bundle, folder = usable_device(device), named_folder(name), locate(name, job)
+    saved = read_config(folder)
+    with told_of(folder / CONFIG_FILE):
+        cls = load_class(saved.generator)
+        config = configuration.from_json(cls.Config, saved.config, str(folder / CONFIG_FILE))
+        weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
+        expected = sum(tensor.numel() for tensor in weights.values())
+        # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
+        with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
+            generator = cls.from_weights(config, saved.sensor, weights, folder / WEIGHTS_FILE)
+    generator.to(there)
     if job == "sample" and is_bundle(bundle):
         generator.bundle = Bundle({each: partial(load, bundle, each) for each in ("complete", "raydrop")})
     return generator

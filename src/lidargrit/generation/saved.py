@@ -9,14 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from lidargrit.core import configuration
+from lidargrit.core.discovery import load_class, names
 from lidargrit.core.errors import ConfigError
-from lidargrit.core.files import read_tensors, write_json, write_tensors, write_text
-from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE, Job, read_config, told_of
+from lidargrit.core.files import write_json, write_tensors, write_text
+from lidargrit.data.run_folder import CARD_FILE, CONFIG_FILE, WEIGHTS_FILE, Job
 from lidargrit.generation.any_sensor import RayNetwork, sharing_weights
 from lidargrit.generation.hub import upload
 from lidargrit.generation.pixel_decoder.ray_encoding import check_bounds
 from lidargrit.nn.exact_weights import load_exactly
-from lidargrit.nn.quantization import WeightBits, with_quantized, without_quantized
+from lidargrit.nn.quantization import WeightBits, with_quantized
 from lidargrit.nn.size import numbers_at_most
 from lidargrit.scans.condition import Observed
 from lidargrit.scans.sensors import SensorModel
@@ -60,13 +61,14 @@ def job_of(condition: Observed) -> Job:
 
 
 ConfigT = TypeVar("ConfigT")
-ModelT = TypeVar("ModelT", bound="SavedModel[Any]")
 
 
 class SavedModel(nn.Module, Generic[ConfigT]):
     """A network that is made from a configuration and a sensor, and that can be written to a folder."""
 
     Config: ClassVar[type]
+    published_files: ClassVar[tuple[str, ...]] = ()
+    """Contents of the files in which the system's authors published weights, in order; empty if we read none."""
 
     def __init__(self, config: ConfigT, sensor: SensorModel) -> None:
         super().__init__()
@@ -77,14 +79,19 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         """Return the name of the folder in which ``system.py`` defines the class."""
         return cls.__module__.removesuffix(".system").rpartition(".")[2]
 
+    @property
+    def takes_any_sensor(self) -> bool:
+        """Whether all of its networks are told a sensor's rays, so that it learns and completes scans of any."""
+        networks = list(self.children())
+        return bool(networks) and all(isinstance(each, RayNetwork) and each.any_sensor for each in networks)
+
     def for_sensor(self, sensor: SensorModel) -> Self:
         """Return the network with the same weights for the scans of another sensor; itself for its own rays.
 
         Raises:
             ConfigError: a sensor that it does not take, with those that it takes.
         """
-        networks = list(self.children())
-        if networks and all(isinstance(each, RayNetwork) and each.any_sensor for each in networks):
+        if self.takes_any_sensor:
             check_bounds(sensor)
             with torch.random.fork_rng(devices=[]):  # the weights that it begins with are not used
                 return sharing_weights(type(self)(self.config, sensor), self).train(self.training)
@@ -123,9 +130,7 @@ class SavedModel(nn.Module, Generic[ConfigT]):
         write_json(folder / CONFIG_FILE, config)
 
     @classmethod
-    def from_weights(
-        cls: type[ModelT], config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path
-    ) -> ModelT:
+    def from_weights(cls, config: Any, sensor: SensorModel, weights: dict[str, Tensor], source: Path) -> Self:
         """Make a generator with given weights."""
         generator = cls(config, sensor)
         load_exactly(generator, weights, source)
@@ -166,7 +171,12 @@ class SavedModel(nn.Module, Generic[ConfigT]):
             the configuration, and the weights of each network by its name here, "" for the whole model; if there are
             several files, one network of each.
         """
-        raise NotImplementedError
+        able = [name for name in names("generators") if load_class("generators", name, SavedModel).published_files]
+        raise ConfigError(
+            f"a generator {cls.public_name()!r}, of which nobody published weights",
+            f"a preset of {', '.join(able)}",
+            "see which generator a preset has with: lidargrit train PRESET OUT --dry-run",
+        )
 
     def save_pretrained(
         self,
@@ -234,20 +244,3 @@ class SavedModel(nn.Module, Generic[ConfigT]):
                 branch=branch,
                 create_pr=create_pr,
             )
-
-
-def read_saved(folder: Path, class_of: Callable[[str], type[ModelT]]) -> ModelT:
-    """Read a network with its configuration and sensor from the folder in which it was saved.
-
-    Args:
-        class_of: function from the name of a system to its class.
-    """
-    saved = read_config(folder)
-    with told_of(folder / CONFIG_FILE):
-        cls = class_of(saved.generator)
-        config = configuration.from_json(cls.Config, saved.config, str(folder / CONFIG_FILE))
-        weights = without_quantized(read_tensors(folder / WEIGHTS_FILE)[0])
-        expected = sum(tensor.numel() for tensor in weights.values())
-        # Twice as many as the file holds, for what is built besides: a wrong file is refused before it fills memory.
-        with numbers_at_most(2 * expected + 2**20, f"{folder / CONFIG_FILE} with a network", "restore both files"):
-            return cls.from_weights(config, saved.sensor, weights, folder / WEIGHTS_FILE)

@@ -131,8 +131,6 @@ def with_budget(preset: Preset, flops: float) -> Preset:
     Args:
         flops: number of floating-point operations that the training may take.
     """
-    if not preset.training:
-        return preset
     costs, share, scaled = stage_costs(preset), 1.0, preset
     if not costs:
         return preset

@@ -151,6 +151,9 @@ def check_stages(preset: Preset, processes: int = 1) -> CheckedStages:
     with torch.device("meta"):  # sizes alone, without values, so that wide networks take no time
         generator = preset.build_generator(sensor).to("meta")
         objectives = {name: generator.objective(name) for name in generator.stages}
+    if preset.data.own_sensors and not generator.takes_any_sensor:
+        got = f"data.own_sensors=true for {generator.public_name()!r}, whose networks know the rays of one sensor"
+        raise ConfigError(got, "a model of any sensor, such as multiscale_any", "leave it out")
     taken = taken_stages(preset, generator)
     told = conditions.load(preset.data.condition, generator.past_scans)
     if told.kind is not Nothing and told.kind not in generator.takes:
