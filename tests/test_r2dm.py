@@ -313,6 +313,8 @@ def test_a_completed_scan_keeps_what_was_observed():
     assert torch.equal(again.range_m, done.range_m)
     with pytest.raises(ConfigError, match="1 seeds for 2 images"):
         generator.complete(Observed.of_pixels(images, observed), [0])
+    with pytest.raises(ConfigError, match="1 seeds for 2 images"):
+        list(generator.stream([0], condition=Observed.of_pixels(images, observed)))
     with pytest.raises(ConfigError, match="sampler=ddim for completion"):
         generator.complete(Observed.of_pixels(images, observed), [0, 1], DiffusionSampling(sampler="ddim"))
     with pytest.raises(ConfigError, match="observed pixels of shape"):

@@ -128,8 +128,7 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages of training, in their order; they may depend on ``config``."""
-        there = dict(self.named_children())
-        return tuple(stage for stage, *names in self.trains if all(name in there for name in names))
+        return tuple(stage for stage, *names in self.trains if dict(self.named_children()).keys() >= {*names})
 
     @property
     def full_rows(self) -> range | None:
@@ -211,6 +210,9 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         self, seeds: Iterable[int], sampling: SamplingT | None = None, condition: Condition = NOTHING
     ) -> Iterator[RangeImage]:
         """Yield the scans of :meth:`sample` one by one; seeds may be without end, such as ``itertools.count(0)``."""
+        if not isinstance(condition, Nothing):  # whose scans are to be as many, before any is computed
+            seeds = seeds if isinstance(seeds, Sequence) else list(islice(seeds, len(condition) + 1))
+            check_seeds(seeds, len(condition))
         remaining, size = iter(seeds), self.batch_size(sampling)
         for number, some in enumerate(iter(lambda: list(islice(remaining, size)), [])):
             images = self.sample(some, condition[number * size : (number + 1) * size], sampling)
@@ -222,7 +224,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
 
     def get_tokenizer(self) -> Tokenizer[Any]:
         """Return the tokenizer whose tokens the generator samples (capability ``tokens``)."""
-        raise self._cannot("tokens")
+        self._require("tokens")
+        raise NotImplementedError
 
     @final
     @inference()
@@ -324,12 +327,10 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return default() if given is None else given
 
     def _require(self, capability: str) -> None:
-        if capability not in self.capabilities:
-            raise self._cannot(capability)
-
-    def _cannot(self, capability: str) -> ConfigError:
+        if capability in self.capabilities:
+            return
         able = [name for name in discovery.names("generators") if capability in load_class(name).capabilities]
-        return ConfigError(
+        raise ConfigError(
             f"a generator {self.public_name()!r}, which cannot {CAPABILITIES[capability]}",
             f"one that can: {', '.join(able) or 'none of ours'}",
             "see what each can do with: lidargrit list generators",

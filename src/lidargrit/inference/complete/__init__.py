@@ -11,7 +11,6 @@ from lidargrit.core.errors import ConfigError, UnknownNameError, nearest_names, 
 from lidargrit.data.images import Provenance
 from lidargrit.data.run_folder import PACKAGED, Job, locate, projection_variant, takes_any_sensor, trained_on
 from lidargrit.data.sources.scan_sensor import other_sensor
-from lidargrit.generation.batches import check_seeds
 from lidargrit.generation.facts import SamplingSettings
 from lidargrit.generation.generator import Generator, load, load_class
 from lidargrit.inference.samples import sampling_identity
@@ -58,7 +57,6 @@ class Model:
 
     def complete(self, condition: Observed, seeds: Sequence[int]) -> RangeImage:
         """Return scans that keep what was observed, one for each seed, in the computer's memory."""
-        check_seeds(seeds, len(condition))
         return RangeImage.stack([image.to("cpu") for image in self.generator.stream(seeds, self.sampling, condition)])
 
     def learned_from(self) -> Provenance:
