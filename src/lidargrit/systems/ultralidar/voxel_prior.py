@@ -140,6 +140,7 @@ def generate_tokens(
     fill: Callable[[Float[Tensor, "B T K"]], Int[Tensor, "B T"]],
     gumbel: Callable[[], Float[Tensor, "B T"]],
     sampling: FillSampling,
+    blank: Int[Tensor, "B blank"] | None = None,
 ) -> Int[Tensor, "B T"]:
     """Sample all tokens of new scans, in passes that show more and more of them.
 
@@ -149,8 +150,9 @@ def generate_tokens(
         fill: sampler of tokens: logits of every token → a token each.
         gumbel: source of noise of Gumbel's distribution.
         sampling: number of passes, and how they are made.
+        blank: codes that stand for empty space; by default the likeliest of the first pass.
     """
-    tokens, hidden, blank = start, torch.ones_like(start, dtype=torch.bool), None
+    tokens, hidden = start, torch.ones_like(start, dtype=torch.bool)
     for done in range(1, sampling.steps + 1):
         logits = logits_of(tokens, hidden)
         if blank is None:
