@@ -4,12 +4,16 @@ LidarGritError (ValueError)
 ├── UsageError        the words of a command are not such as it knows
 ├── ScanError         a scan file, or the points in it, cannot be used
 ├── DataError         a folder or a data source is not what was asked for
+│   └── ClusterError  workers of a cluster died
 ├── UnknownNameError  no sensor, preset, metric, ... of that name
 ├── ConfigError       a preset's setting is unknown or out of its bounds
 ├── CheckpointError   weights or a run that are damaged or of another configuration
 ├── WeightsError      published weights of a network that are not to be had, or not what they should be
 ├── OutputError       a file or folder to write is taken, or could not be written
+│   └── HeldError     another process writes into the folder
 └── TrainingError     training cannot go on: the loss is not a number, the codebook collapsed
+
+``Terminated`` is no mistake: SIGTERM ended the work.
 """
 
 import difflib
