@@ -128,7 +128,8 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages of training, in their order; they may depend on ``config``."""
-        return tuple(stage for stage, *names in self.trains if dict(self.named_children()).keys() >= {*names})
+        there = dict(self.named_children()).keys()
+        return tuple(stage for stage, *names in self.trains if there >= {*names})
 
     @property
     def full_rows(self) -> range | None:
@@ -327,14 +328,13 @@ class Generator(SavedModel[ConfigT], ABC, Generic[ConfigT, SamplingT]):
         return default() if given is None else given
 
     def _require(self, capability: str) -> None:
-        if capability in self.capabilities:
-            return
-        able = [name for name in discovery.names("generators") if capability in load_class(name).capabilities]
-        raise ConfigError(
-            f"a generator {self.public_name()!r}, which cannot {CAPABILITIES[capability]}",
-            f"one that can: {', '.join(able) or 'none of ours'}",
-            "see what each can do with: lidargrit list generators",
-        )
+        if capability not in self.capabilities:
+            able = [name for name in discovery.names("generators") if capability in load_class(name).capabilities]
+            raise ConfigError(
+                f"a generator {self.public_name()!r}, which cannot {CAPABILITIES[capability]}",
+                f"one that can: {', '.join(able) or 'none of ours'}",
+                "see what each can do with: lidargrit list generators",
+            )
 
     @classmethod
     def about(cls) -> list[str]:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
@@ -10,7 +11,6 @@ from lidargrit.generation import conditions
 from lidargrit.generation.settings import Preset
 from lidargrit.scans.example import Example
 from lidargrit.training.compute import duration, training_flops, uniform_images
-from lidargrit.training.engine import Engine
 from lidargrit.training.stage import begin_training
 
 _WARM_UP_STEPS, _TIMED_STEPS = 1, 3  # the first one allocates and chooses kernels
@@ -50,19 +50,26 @@ def measure(preset: Preset, flops: Mapping[str, int] | None = None) -> list[Meas
     flops = training_flops(preset) if flops is None else flops
     found = []
     for stage, of_stage in flops.items():  # those that are trained
-        per_s, prepared, engine = _timed(preset, stage)
-        seconds = preset.settings_of(stage).scans / per_s * (of_stage / (of_stage - prepared))  # preparing is as fast
-        found.append(Measured(stage, of_stage, per_s, seconds, str(engine.device), engine.peak_gib()))
+        timed = _timed(preset, stage)
+        seconds = preset.settings_of(stage).scans / timed.scans_per_s
+        seconds *= of_stage / (of_stage - timed.prepared_flops)  # preparing is as fast
+        found.append(Measured(stage, of_stage, timed.scans_per_s, seconds, timed.device, timed.peak_gib))
     return found
 
 
 def scans_per_s(preset: Preset, stage: str) -> float:
     """Return on how many scans a second this machine trains a stage, without reading and validation."""
-    return _timed(preset, stage)[0]
+    return _timed(preset, stage).scans_per_s
 
 
-def _timed(preset: Preset, stage: str) -> tuple[float, int, Engine]:
-    """Return the scans a second of a stage, the operations that prepare it, and what it ran on."""
+class _Timed(NamedTuple):
+    scans_per_s: float
+    prepared_flops: int
+    device: str
+    peak_gib: float
+
+
+def _timed(preset: Preset, stage: str) -> _Timed:
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(0)
         generator = preset.build_generator()
@@ -79,4 +86,5 @@ def _timed(preset: Preset, stage: str) -> tuple[float, int, Engine]:
             seed = 0 if prepared else step
             example = Example(new, condition.of(new))
             float(engine.step(example, seed, config.gradient_clip, config.accumulate)["loss"])  # waits for a GPU
-        return _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun), prepared, engine
+        per_s = _TIMED_STEPS * config.batch_size / (time.perf_counter() - begun)
+        return _Timed(per_s, prepared, str(engine.device), engine.peak_gib())
