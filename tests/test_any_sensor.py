@@ -279,8 +279,9 @@ def test_commands_take_another_sensor(run, tmp_path, monkeypatch, capsys) -> Non
 
 def test_a_run_for_any_sensor_samples_the_same_when_it_is_read_again(run) -> None:
     generator, sensor = load(run / "run"), load_sensor(str(run / "mine.json"))
-    once = generator.for_sensor(sensor).sample([3], sampling=PixelSampling(1.0, 1.0, 0.0))
-    again = load(run / "run").for_sensor(sensor).sample([3], sampling=PixelSampling(1.0, 1.0, 0.0))
+    as_learned = PixelSampling(range_temperature=1.0, range_noise=1.0, mask_correlation=0.0)
+    once = generator.for_sensor(sensor).sample([3], sampling=as_learned)
+    again = load(run / "run").for_sensor(sensor).sample([3], sampling=as_learned)
     assert torch.equal(once.range_m, again.range_m)
     assert once.sensor is sensor
     own = generator.sample([3]).range_m

@@ -72,7 +72,8 @@ def test_pixels_come_back_rounded_to_the_step(codec, compressed):
 def test_a_model_without_tokens_compresses_too(halvings):
     config = MultiscaleConfig(replace(PIXELS, coarsest_cell=4, **halvings))
     generator = with_random_weights(Multiscale(config, SENSOR))
-    codec, image = ScanCodec(generator, 20), generator.sample([0], sampling=PixelSampling(1.0, 1.0))
+    codec = ScanCodec(generator, 20)
+    image = generator.sample([0], sampling=PixelSampling(range_temperature=1.0, range_noise=1.0))
     compressed, bits = codec.compress(image[0]), float(generator.bits(image, 20).total())
     assert torch.equal(codec.decompress(compressed).range_m, codec.steps.round(image).range_m[0])
     assert 0.99 * bits < 8 * len(compressed) < 1.01 * bits + 72 + 64

@@ -220,21 +220,22 @@ def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
     assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 
+@pytest.mark.parametrize("name", ["range_temperature", "surface_temperature"])
 @torch.no_grad()
-def test_a_model_has_a_range_temperature_of_its_own() -> None:
+def test_a_model_has_temperatures_of_its_own(name: str) -> None:
     sensor = tiny_sensor(16, 32)
     decoder, decoded = random_decoder(sensor, 4, spread=0.06), random_decoded(sensor, 2)
 
     def sample(own: float, asked_for: float = 0.0) -> Tensor:
-        decoder.config = replace(decoder.config, range_temperature=own)
+        decoder.config = replace(decoder.config, **{name: own})
         rngs = [torch.Generator().manual_seed(seed) for seed in range(2)]
-        return decoder.sample(decoded, rngs, PixelSampling(asked_for)).range_m
+        return decoder.sample(decoded, rngs, replace(PixelSampling(), **{name: asked_for})).range_m
 
     assert torch.equal(sample(0.1), sample(3.0, asked_for=0.1))
     assert not torch.equal(sample(0.1), sample(3.0))
     for senseless in (0.0, -1.0, math.inf, math.nan):
-        with pytest.raises(ConfigError, match=f"range_temperature={senseless}"):
-            PixelDecoderConfig(range_temperature=senseless)
+        with pytest.raises(ConfigError, match=f"{name}={senseless}"):
+            replace(PixelDecoderConfig(), **{name: senseless})
 
 
 @torch.no_grad()

@@ -107,9 +107,12 @@ def test_a_thin_object_keeps_its_probability_before_and_behind_a_wall(apart: flo
     assert tempered_by_a_loop(vague, 0.1)[0] < 1e-6
 
 
-@pytest.mark.parametrize("temperature", [0.1, 0.35, 0.6, 2.0])
+@pytest.mark.parametrize("of_surfaces", [0.4, 1.0, 3.0])
+@pytest.mark.parametrize("temperature", [0.1, 0.35, 1.0, 2.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_components_are_sharpened_by_their_density_beside_that_of_their_surface(seed: int, temperature: float) -> None:
+def test_components_are_sharpened_by_the_density_on_their_surface_and_its_probability(
+    seed: int, temperature: float, of_surfaces: float
+) -> None:
     rng = torch.Generator().manual_seed(seed)
     centres = torch.tensor([[math.log1p(1.0), 1.5, 1.54, 1.59, 1.65, 2.4, 3.5, math.log1p(80.0)]])
     log_scales = torch.cat(
@@ -118,19 +121,19 @@ def test_components_are_sharpened_by_their_density_beside_that_of_their_surface(
     logits = torch.randn(1, 8, generator=rng)
     logits[0, 5] -= 10
     mixture = RangeMixture(logits, centres, log_scales, (1.0, 80.0))
-    found = shares_of_components(mixture, temperature)
-    np.testing.assert_allclose(found, tempered_by_a_loop(mixture, temperature), atol=1e-3)
+    found = shares_of_components(mixture, temperature, of_surfaces)
+    np.testing.assert_allclose(found, tempered_by_a_loop(mixture, temperature, of_surfaces), atol=1e-3)
 
 
-def shares_of_components(mixture: RangeMixture, temperature: float) -> list[float]:
+def shares_of_components(mixture: RangeMixture, temperature: float, of_surfaces: float = 1.0) -> list[float]:
     """How often each component is sampled: without noise every range is the centre of its component."""
     count = 20_000
     component, within = (torch.arange(count) + 0.5) / count, torch.full((count,), 0.5)
-    v = expanded(mixture, count).sample(component, within, temperature, noise=1e-9).log1p()
+    v = expanded(mixture, count).sample(component, within, temperature, 1e-9, of_surfaces).log1p()
     return [float(((v - centre).abs() < 0.01).float().mean()) for centre in mixture.centres[0].tolist()]
 
 
-def tempered_by_a_loop(mixture: RangeMixture, temperature: float) -> list[float]:
+def tempered_by_a_loop(mixture: RangeMixture, temperature: float, of_surfaces: float = 1.0) -> list[float]:
     weights, power = mixture.logits[0].double().softmax(-1).tolist(), 1 / temperature - 1
     parts = list(zip(weights, mixture.centres[0].tolist(), mixture.log_scales[0].exp().tolist(), strict=True))
     density = partial(density_of_v, parts, mixture.limits_m)
@@ -138,7 +141,7 @@ def tempered_by_a_loop(mixture: RangeMixture, temperature: float) -> list[float]
     for weight, centre, _ in parts:
         there = [w * mass_between(centre - 0.1, centre + 0.1, c, scale) for w, c, scale in parts]
         mean = sum(m * density(c) ** power for m, (_, c, _) in zip(there, parts, strict=True)) / sum(there)
-        tempered.append(weight * density(centre) ** power / mean)
+        tempered.append(weight * density(centre) ** power / mean * sum(there) ** (1 / of_surfaces - 1))
     return [one / sum(tempered) for one in tempered]
 
 

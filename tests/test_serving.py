@@ -38,7 +38,7 @@ def test_numbers_of_every_generator_can_be_chosen():
     found = {name: [setting.name for setting in sampling_settings(made(name)[0].Sampling())] for name in MODELS}
     of_tokens = ["temperature", "top_k", "top_p", "guidance"]
     assert found == {
-        "lidargrit": [*of_tokens, "range_temperature", "range_noise", "mask_correlation"],
+        "lidargrit": [*of_tokens, "range_temperature", "surface_temperature", "range_noise", "mask_correlation"],
         "marginal": [],
         "r2dm": ["steps", "resamples"],
     }

@@ -50,8 +50,10 @@ class DecodingOfTokens(SamplingSettings):
             decoder, and ``bernoulli`` elsewhere.
         range_temperature: temperature of the pixel decoder's density of ranges on one surface; below 1 ranges keep to
             the surface more precisely; 0 takes the model's own (``model.pixels.range_temperature``). Only scans sampled
-            with 1, a noise of 1, a correlation of 0 and a guidance of 1 follow the distribution whose likelihood the
-            model gives.
+            with temperatures, noise and guidance of 1 and a correlation of 0 follow the distribution whose likelihood
+            the model gives.
+        surface_temperature: temperature of the pixel decoder's choice between surfaces that lie apart; below 1 edges of
+            objects are less ragged; 0 takes the model's own (``model.pixels.surface_temperature``).
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
             sampled at once; 0 samples them independently.
@@ -62,6 +64,7 @@ class DecodingOfTokens(SamplingSettings):
 
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
+    surface_temperature: float = PixelSampling.surface_temperature
     range_noise: float = PixelSampling.range_noise
     mask_correlation: float = PixelSampling.mask_correlation
     decoder: Precision = "fp32"
@@ -72,7 +75,13 @@ class DecodingOfTokens(SamplingSettings):
 
     def pixels(self) -> PixelSampling:
         """Return the settings of the pixel decoder."""
-        return PixelSampling(self.range_temperature, self.range_noise, self.mask_correlation, self.decoder)
+        return PixelSampling(
+            range_temperature=self.range_temperature,
+            surface_temperature=self.surface_temperature,
+            range_noise=self.range_noise,
+            mask_correlation=self.mask_correlation,
+            precision=self.decoder,
+        )
 
 
 @dataclass(frozen=True)

@@ -61,8 +61,10 @@ class PixelDecoderConfig(Settings):
         any_sensor: whether the networks are told the angles of each row, by a small perceptron, in place of values that
             are learned row by row, so that the weights serve every spinning sensor; ``coarsest_cell`` is then the
             largest, and smaller images begin with smaller cells.
-        range_temperature: temperature at which ranges are sampled where the caller names none. What suits a model
-            depends on its columns and its training: choose it by samples against validation scans.
+        range_temperature: temperature of ranges on one surface where the caller names none. What suits a model depends
+            on its columns and its training: choose it by samples against validation scans.
+        surface_temperature: temperature of the choice between surfaces where the caller names none. Below 1 edges of
+            objects are less ragged; where the tokenizer tells little of thin objects, more of these are lost.
     """
 
     coarsest_cell: Count = 8
@@ -82,6 +84,7 @@ class PixelDecoderConfig(Settings):
     own_context: Share = 0.0
     any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
+    surface_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -39,18 +39,20 @@ _EVEN = 0.4999  # in place of a random number: what is as likely as not returns
 BITS_STEP_M = 0.01  # bits of a return are those of naming its range to a centimetre
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PixelSampling(SamplingSettings):
     """Settings of sampling masks, and ranges from their mixtures.
 
     By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
-    pixels that are sampled with 1, 1 and a correlation of 0 follow the distribution, given the tokens, whose likelihood
-    the model computes.
+    pixels that are sampled with 1, 1, 1 and a correlation of 0 follow the distribution, given the tokens, whose
+    likelihood the model computes.
 
     Args:
         range_temperature: temperature of the mixture's density on one surface; 1 leaves it unchanged, below 1 prefers
             the densest of the components there. Surfaces that lie apart keep their probabilities. 0 takes the model's
             own temperature (``model.pixels.range_temperature``).
+        surface_temperature: temperature of the choice between surfaces that lie apart; 1 leaves it unchanged, below 1
+            prefers the more probable one. 0 takes the model's own (``model.pixels.surface_temperature``).
         range_noise: multiplier of the components' scales; 1 takes them as they are.
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
             so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
@@ -61,6 +63,7 @@ class PixelSampling(SamplingSettings):
     """
 
     range_temperature: Temperature = 0.0
+    surface_temperature: Temperature = 0.0
     range_noise: Annotated[float, Bounds(above=0, most=_NOISE_AT_MOST)] = 0.7
     mask_correlation: Weight = 2.0
     precision: Precision = "fp32"
@@ -294,19 +297,20 @@ class PixelDecoder(RayNetwork):
     ) -> Float[Tensor, "B H W"]:
         """Return the ranges of a whole mask, sampled phase by phase around the observed ones."""
         temperature = sampling.range_temperature or self.config.range_temperature
+        of_surfaces = sampling.surface_temperature or self.config.surface_temperature
         guided = self.range.guided(guide)
         range_m, v = torch.zeros_like(guide.v), torch.zeros_like(guide.v)
         for phase in self.range.phases:
             pixels = (..., *phase.pixels)
             mixture = self.range.distributions([phase], guided, guide, mask, v)
-            if self.config.any_sensor and temperature != 1:
+            if self.config.any_sensor and (temperature, of_surfaces) != (1, 1):
                 mixture = mixture.without_last()  # which is any range at all
             # Of every pixel, though some are observed and some do not return: the host need not know which.
             component, within = uniform[pixels][None].unbind(2)
             if sampling.point:
                 sampled = mixture.median()[0]
             else:
-                sampled = mixture.sample(component, within, temperature, sampling.range_noise)[0]
+                sampled = mixture.sample(component, within, temperature, sampling.range_noise, of_surfaces)[0]
             found = torch.where(condition.range_observed[pixels], condition.range_m[pixels], sampled)
             range_m[pixels] = found.where(mask[pixels], 0.0)
             v[pixels] = range_m[pixels].log1p()

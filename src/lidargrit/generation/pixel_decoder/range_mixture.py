@@ -105,7 +105,12 @@ class RangeMixture:
         return total
 
     def sample(
-        self, component: Float[Tensor, "*P"], within: Float[Tensor, "*P"], temperature: float = 1.0, noise: float = 1.0
+        self,
+        component: Float[Tensor, "*P"],
+        within: Float[Tensor, "*P"],
+        temperature: float = 1.0,
+        noise: float = 1.0,
+        surface_temperature: float = 1.0,
     ) -> Float[Tensor, "*P"]:
         """Return one range in metres for each pixel.
 
@@ -115,9 +120,11 @@ class RangeMixture:
             temperature: temperature of the density on one surface; 1 leaves it unchanged, below 1 prefers the densest
                 of the components there. Surfaces that lie apart keep their probabilities.
             noise: multiplier of the components' scales.
+            surface_temperature: temperature of the choice between surfaces that lie apart; below 1 prefers the more
+                probable one.
         """
         scaled = RangeMixture(
-            self._tempered_logits(temperature),
+            self._tempered_logits(temperature, surface_temperature),
             self.centres,
             self.log_scales + torch.tensor(noise, dtype=self.log_scales.dtype).log(),
             self.limits_m,
@@ -129,7 +136,7 @@ class RangeMixture:
         level = (low + within.double() * (high - low)).clamp(1e-9, 1 - 1e-9)
         return (centre + scale * level.logit()).expm1().clamp(*self.limits_m).float()
 
-    def _tempered_logits(self, temperature: float) -> Float[Tensor, "*P K"]:
+    def _tempered_logits(self, temperature: float, surface_temperature: float) -> Float[Tensor, "*P K"]:
         """Return the logits of the components' weights at a temperature T of the density on each surface.
 
         The surface of a component is what lies within ``SURFACE_V`` of its centre. The component's weight is
@@ -137,16 +144,19 @@ class RangeMixture:
         surface: over all components, each counted by its probability there, cut-offs left out. So components compete
         with those that reach the same surface: a pole loses little to the wall behind it, and only where it is so broad
         that the wall lies within its spread. A temperature of the whole density would take half of all poles away.
+
+        At a temperature S of the surfaces the weight is multiplied by m^(1/S - 1) besides, where m is the probability
+        of the component's surface.
         """
-        if temperature == 1:
+        if temperature == surface_temperature == 1:
             return self.logits
 
         def log_correction(pairs: "_Pairs") -> Tensor:
             power = pairs.log_density().mul_(1 / temperature - 1)
             there = pairs.mass_near_centres()
-            mass = there.sum(0)
+            log_mass = _finite_log(there.sum(0))
             by_power = (power.T[..., None] - power).clamp_(max=_LARGEST_EXPONENT).exp_()
-            return _finite_log(mass).sub_(_finite_log(there.mul_(by_power).sum(0)))
+            return log_mass.div_(surface_temperature).sub_(_finite_log(there.mul_(by_power).sum(0)))
 
         return self.logits.log_softmax(-1) + self._by_pairs(log_correction)
 

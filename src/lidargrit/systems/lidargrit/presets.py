@@ -152,6 +152,7 @@ _BESIDE_FINE_CELLS = replace(
     decoded_components=True,
     weighed_components=True,
     range_temperature=0.2,  # for pixels that learn beside true neighbours last
+    surface_temperature=0.5,  # tokens tell where thin objects stand, which are lost without them
 )
 _FOR_A_DEMO = {
     "data.train": ("simulated:256:train",),
