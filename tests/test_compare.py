@@ -108,6 +108,7 @@ def test_samples_that_are_there_are_scored_beside_systems_that_are_made(tmp_path
     [
         ([], "at least one"),
         (["marginal", "marginal"], "each once"),
+        (["a/scores.json", "b/scores.json"], "'scores' in the table"),
         (["marginl"], "marginal"),
         (["r2dm_small:step=3"], "steps"),
     ],

@@ -70,6 +70,14 @@ def test_scores_of_samples_called_costs_are_not_taken_for_their_costs(tmp_path, 
     assert values[0] == values[1]
 
 
+def test_a_folder_of_a_system_is_neither_the_page_nor_too_long_for_a_disk(tmp_path):
+    deep = "/".join(["samples" * 8] * 8)
+    for system, name in (("table.html", "table.html_"), (f"{deep}/mine", f"{deep}/mine".replace("/", "_")[-200:])):
+        assert compare._folder_name(system) == name
+        (tmp_path / name).mkdir()
+    assert len(compare._folder_name("é" * 200).encode()) <= 200
+
+
 def test_scores_are_computed_again_for_other_reflectance_on_the_same_ranges(tmp_path):
     settings = EvalConfig(metrics=("reflectance_histogram",), resampling=Resampling(halves=0))
 

@@ -132,6 +132,8 @@ def test_complete_keeps_names_and_observed_points_and_goes_on(folders, tmp_path,
     assert (tmp_path / "out/drive/2.npz").exists()
     assert main([*words[:-3], "linear", *words[-2:]]) == 2
     assert "completed.json has another 'model'" in capsys.readouterr().err
+    assert main([*words, "--projection", "spherical"]) == 2, "two projections in one folder"
+    assert "completed.json has another 'projection'" in capsys.readouterr().err
 
 
 def test_a_model_completes_in_several_ways_and_into_any_format(folders, tmp_path):

@@ -276,6 +276,7 @@ def test_an_interrupted_file_goes_on_only_with_the_options_that_say_which_scans(
         ("b", [], "source"),
         ("a", ["-n", "2"], "max_scans"),
         ("b", ["-n", "2"], "source, max_scans"),
+        ("a", ["--projection", "spherical"], "projection"),
     ):
         capsys.readouterr()
         assert compress(source, "scans.lgz", *words) == 2

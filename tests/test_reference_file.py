@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -231,6 +232,9 @@ def test_the_commands(tmp_path, capsys, monkeypatch):
     assert "a name in .lgref" in the_one_line(capsys.readouterr().err, "evaluate")
     assert main(["evaluate", SAMPLES, "a.lgref", "--report", "page.html", "--intervals", "0"]) == 2
     assert "--report with a.lgref, which holds no scan" in the_one_line(capsys.readouterr().err, "evaluate")
+    Path("A.LGREF").write_bytes(Path("a.lgref").read_bytes())
+    assert main(["evaluate", SAMPLES, "A.LGREF", "--report", "page.html", "--intervals", "0"]) == 2
+    assert "A.LGREF, which holds no scan" in the_one_line(capsys.readouterr().err, "evaluate")
     with pytest.raises(ConfigError, match=r"--groups 16 with a\.lgref, which was made with 0"):
         api.evaluate(SAMPLES, "a.lgref", metrics=["bev_jsd"])
     assert main(["view", "a.lgref", "-o", "a.html"]) == 2

@@ -245,6 +245,8 @@ def test_the_verb_writes_a_label_for_every_point_and_goes_on(run, tmp_path, caps
     (tmp_path / "out/sequences/00/velodyne/000000.bin").unlink()
     assert main(words) == 0
     assert labels[0].read_bytes() == before
+    assert main([*words, "--projection", "spherical"]) == 2
+    assert "segmented.json has another 'projection'" in capsys.readouterr().err
     (tmp_path / "in/sequences/00/velodyne/000000.bin").write_bytes(b"cut")  # the labels of the next one are looked at
     skipping = ["segment", str(tmp_path / "in"), str(tmp_path / "skipped"), *words[3:], "--bad-scans", "skip"]
     assert main([*skipping, "--compare", "semantic_kitti"]) == 0

@@ -31,7 +31,7 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
     The same command goes on, but for completions, which begin anew.
     """
     from lidargrit.core.files import write_text
-    from lidargrit.evaluation.compare import as_json, as_table, run
+    from lidargrit.evaluation.compare import PAGE, as_json, as_table, run
     from lidargrit.evaluation.reproduction import plan, plan_as_text, prepare
     from lidargrit.evaluation.table_folder import write_table
     from lidargrit.viewer.table_page import table_page
@@ -48,8 +48,8 @@ def compared(options: argparse.Namespace) -> tuple[str, Any, str]:
         prepare(comparison, systems)
     scores = run(systems, options.out, comparison, options.workers)
     write_table(options.out, systems, comparison, scores)
-    write_text(options.out / "table.html", table_page(as_json(scores), comparison.flops))
-    done = f"done: {options.out / 'table.html'} sorts the table in a browser"
+    write_text(options.out / PAGE, table_page(as_json(scores), comparison.flops))
+    done = f"done: {options.out / PAGE} sorts the table in a browser"
     return as_table(scores, options.table, paper.remarks() if paper else ()), as_json(scores), done
 
 

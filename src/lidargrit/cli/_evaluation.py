@@ -36,9 +36,10 @@ def evaluated(options: argparse.Namespace) -> tuple[str, dict[str, Any], Callabl
     if options.save_reference:
         refuse_unused(options, "with --save-reference", ("save_reference", *_OF_REFERENCE, *_OF_CARDS))
         return *_saved(options, config), None
-    if options.report and sets[1].endswith(ENDING):
+    is_file = sets[1].lower().endswith(ENDING)
+    if options.report and is_file:
         raise ConfigError(f"--report with {sets[1]}, which holds no scan", "scans to show", "leave it out")
-    streets = streets_of(options.samples, config) if options.reference and not sets[1].endswith(ENDING) else None
+    streets = streets_of(options.samples, config) if options.reference and not is_file else None
     if streets is None:
         refuse_unused(options, "without --protocol streets", ("ray", *_OF_BOTH, *_OF_CARDS))
         refuse_to_overwrite(options.report, options.overwrite, ".html")

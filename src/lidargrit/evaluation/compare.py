@@ -43,7 +43,10 @@ from lidargrit.training import check_folder, train, with_budget
 from lidargrit.training.compute import duration
 from lidargrit.training.plan import check_stages
 
+PAGE = "table.html"
+"""The page of the table, beside the folders of the systems."""
 _SCORES = ".json"  # what evaluate --json wrote
+_NAME_BYTES = 200  # of a folder's name, of 255: the name of its file of scores is longer
 _SAMPLES_AT_MOST = 10**8  # names of files have eight digits
 
 
@@ -101,10 +104,11 @@ def run(systems: Sequence[str], folder: Path, comparison: CompareConfig, process
         processes: number of systems that are made at the same time, each in a process with its share of the cores.
     """
     names = [_folder_name(system) for system in systems]
-    if len(set(names)) < len(names) or not names:
-        raise ConfigError(
-            f"the systems {', '.join(systems) or '(none)'}", "each once, and at least one", "correct them"
-        )
+    if not names:
+        raise ConfigError("no system", "at least one preset, run, folder of samples or file of scores", "name some")
+    if twice := [system for system, name in zip(systems, names, strict=True) if names.count(name) > 1]:
+        got = f"{' and '.join(twice)}, of which several would be called {_folder_name(twice[0])!r} in the table"
+        raise ConfigError(got, "each once, by a name of its own", "name each once, or rename a file or folder")
     # Wrong words and runs of other presets are refused before anything is trained.
     plans = [_SystemJob.of(system, folder, comparison) for system in systems]
     reference = open_source(comparison.reference, comparison.settings.data.bad_points)
@@ -190,42 +194,38 @@ def _finish(
 ) -> int:
     """Train or load the systems of one run, sample from each, score the samples, and return how many were sampled."""
     sampled = 0
-    settings = comparison.evaluation()
-    reference = reference or open_source(comparison.reference, settings.data.bad_points)
+    reference = reference or open_source(comparison.reference, comparison.settings.data.bad_points)
     for plan in plans:
         name = _folder_name(plan.system)
+        here, scores = folder / name, folder / name / f"{name}{_SCORES}"
         reporting.message(f"{name}:")
-        if plan.samples is not None:
-            _score_samples(plan.samples, folder / name, comparison, reference)
-            continue
         if plan.card is not None:
-            write_json(folder / name / f"{name}.json", plan.card.to_json())
-            Costs(folder / name / COSTS, plan.card.samples.weights_sha256).write_unknown()
-            continue
-        generator = load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run)
-        generator.to(usable_device(""))
-        samples = folder / name / "samples"
-        timed = _sample(generator, plan.run, samples, plan.sampling, comparison)
-        sampled += timed is not None
-        costs = Costs(folder / name / COSTS, weights_sha256(plan.run))
-        costs.write(generator, plan.sampling, plan.preset, timed)
-        pair = _of_first_seeds(open_pair(open_source(str(samples)), reference, settings), samples)
-        costs.add_bits(generator, pair.reference)
-        _score(pair, settings, folder / name / f"{name}.json")
-        _warn_of_limits(pair, comparison)
+            write_json(scores, plan.card.to_json())
+            Costs(here / COSTS, plan.card.samples.weights_sha256).write_unknown()
+        elif plan.samples is not None:
+            _score_samples(plan.samples, reference, comparison, scores)
+            Costs(here / COSTS, plan.samples.weights_sha256).write_unknown()
+        else:
+            generator = load(plan.run) if plan.preset is None or is_run(plan.run) else train(plan.preset, plan.run)
+            generator.to(usable_device(""))
+            timed = _sample(generator, plan.run, here / "samples", plan.sampling, comparison)
+            sampled += timed is not None
+            costs = Costs(here / COSTS, weights_sha256(plan.run))
+            costs.write(generator, plan.sampling, plan.preset, timed)
+            pair = _score_samples(open_source(str(here / "samples")), reference, comparison, scores)
+            costs.add_bits(generator, pair.reference)
     return sampled
 
 
-def _score_samples(samples: Source, folder: Path, comparison: CompareConfig, reference: Source) -> None:
-    """Score samples that are there, of which neither the costs nor the training are known."""
+def _score_samples(samples: Source, reference: Source, comparison: CompareConfig, path: Path) -> EvalPair:
+    """Write the scores of samples into a file, unless it holds them, and return the two sets."""
     settings = comparison.evaluation()
     pair = open_pair(samples, reference, settings)
     if samples.folder is not None:
         pair = _of_first_seeds(pair, samples.folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    Costs(folder / COSTS, samples.weights_sha256).write_unknown()
-    _score(pair, settings, folder / f"{folder.name}.json")
+    _score(pair, settings, path)
     _warn_of_limits(pair, comparison)
+    return pair
 
 
 def _warn_of_limits(pair: EvalPair, comparison: CompareConfig) -> None:
@@ -256,7 +256,9 @@ def _folder_name(system: str) -> str:
     run, colon, settings = system.partition(":")
     name = (run if run.strip("./") else Path(run).resolve().name).replace("/", "_") + colon + settings.replace("/", "_")
     name = Path(system).stem if system.endswith(_SCORES) else name
-    return f"{name}_" if f"{name}{_SCORES}" == COSTS else name  # else its scores would be its costs
+    name = name.encode()[-_NAME_BYTES:].decode(errors="ignore")  # the end of a path tells most
+    taken = name == PAGE or f"{name}{_SCORES}" == COSTS  # or its folder would be the page, or its scores its costs
+    return f"{name}_" if taken else name
 
 
 def _share(processes: int) -> None:

@@ -258,9 +258,8 @@ def _facts(model: Model, output: OutputConfig) -> dict[str, Any]:
         got = f"--samples {output.count} for {model.name}"
         raise ConfigError(got, "1: it completes a scan in one way", "leave it out")
     made = {**model.identity(), "count": output.count, "seed": output.seed, "format": output.format}
-    if output.probability:
-        made["probability"] = output.probability  # files of before it were written without these shares
-    return made
+    named = {"probability": output.probability, "projection": model.projection}
+    return made | {name: of for name, of in named.items() if of not in (0, "sensor")}  # as folders without them are
 
 
 def _files(inputs: Inputs, source: str, output: OutputConfig) -> list[str]:

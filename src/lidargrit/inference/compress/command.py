@@ -58,7 +58,7 @@ def compress_scans(
     names = [inputs.scans.name(index) for index in range(len(inputs))]
     check_names(source, names)  # of which a file has each once
     _tell_of_drives(inputs.scans, model)
-    chosen |= {"bad_points": config.bad_points, "bad_scans": config.bad_scans}
+    chosen |= {"projection": config.projection, "bad_points": config.bad_points, "bad_scans": config.bad_scans}
     with writing(out, _header(compressor.codec, model, sensor), chosen) as writer:
         missing = writer.missing([compressor.identity(index) for index in range(len(inputs))])
         do = partial(_write_some, work, writer.folder) if ray else partial(compressor.write, writer.folder)

@@ -110,6 +110,7 @@ def segment_scans(
     files = KittiTree(out).files([source_scans.name(index) for index in range(len(source_scans))])
     identities = [source_scans.identity(index) for index in range(len(files))]
     facts = {"source": source, "weights_sha256": weights_sha256(locate(model, "segment"))}
+    facts |= {"projection": config.projection} if config.projection != "sensor" else {}
     folder = ScanFolder(out, MANIFEST, facts, files, identities, config.bad_scans)
     scores = LabelScores() if numbering else None
     wanted = folder.missing if scores is None else range(len(files))
