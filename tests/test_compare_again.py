@@ -72,6 +72,7 @@ def test_scores_of_samples_called_costs_are_not_taken_for_their_costs(tmp_path, 
 
 def test_a_folder_of_a_system_is_neither_the_page_nor_too_long_for_a_disk(tmp_path):
     deep = "/".join(["samples" * 8] * 8)
+    assert {compare._folder_name(word) for word in ("marginal", "marginal/", "./marginal")} == {"marginal"}
     for system, name in (("table.html", "table.html_"), (f"{deep}/mine", f"{deep}/mine".replace("/", "_")[-200:])):
         assert compare._folder_name(system) == name
         (tmp_path / name).mkdir()

@@ -1,6 +1,7 @@
 """Figures that tell simulated scans from real ones, against slow loops, SciPy and surfaces whose value is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,14 @@ def test_columns_of_walls_against_a_slow_loop():
     found, slow = column_distances_m(image).sort().values, sorted(slow_columns(image))
     assert len(slow) > 500
     assert np.allclose(found.numpy(), slow, atol=1e-6)
+
+
+def test_a_sensor_of_four_rows_has_all_figures_but_that_of_ten_rows():
+    sensor = replace(load_sensor("vlp16").with_columns(64), elevation_rad=SENSOR.elevation_rad[:4])
+    range_m = torch.full((1, 4, 64), 20.0)
+    figures = StreetFigures.of([RangeImage(range_m, range_m > 0, sensor)])
+    assert "10 rows of a column, walls" not in figures.pooled
+    assert figures.pooled["returns, rows 15 to 31 of 64"] == 100
 
 
 def test_noise_on_walls_is_that_of_chi_squared_distributions():

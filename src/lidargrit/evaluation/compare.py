@@ -254,8 +254,8 @@ def _of_first_seeds(pair: EvalPair, folder: Path) -> EvalPair:
 def _folder_name(system: str) -> str:
     """Return the name of a system's folder in the table; "." and ".." stand for the folders that they name."""
     run, colon, settings = system.partition(":")
-    name = (run if run.strip("./") else Path(run).resolve().name).replace("/", "_") + colon + settings.replace("/", "_")
-    name = Path(system).stem if system.endswith(_SCORES) else name
+    own = str(Path(run)) if run.strip("./") else Path(run).resolve().name  # "runs/mine/" is "runs/mine"
+    name = Path(system).stem if system.endswith(_SCORES) else f"{own}{colon}{settings}".replace("/", "_")
     name = name.encode()[-_NAME_BYTES:].decode(errors="ignore")  # the end of a path tells most
     taken = name == PAGE or f"{name}{_SCORES}" == COSTS  # or its folder would be the page, or its scores its costs
     return f"{name}_" if taken else name

@@ -186,6 +186,8 @@ def column_distances_m(image: RangeImage) -> Tensor:
     Returns:
         metres, one value a run.
     """
+    if image.sensor.height < _COLUMN_RUN:
+        return torch.zeros(0)
     range_m = torch.where(image.return_mask, image.range_m, torch.nan)
     points_xyz_m = points_of_pixels(image).double()
     # Columns become rows, which are circular: what begins in the last rows is left out.
