@@ -1,5 +1,6 @@
 """Metrics of what stands in scans: against slow loops and SciPy, and how they rank known damages."""
 
+import dataclasses
 import functools
 import math
 
@@ -73,6 +74,16 @@ def test_an_object_may_lie_across_the_first_and_the_last_column():
     image = streets(*GENERATED)[:1]
     turned = image.mapped(lambda pixels: pixels.roll(100, -1))
     assert sorted(objects_in(image).returns) == sorted(objects_in(turned).returns)
+
+
+def test_labels_that_no_class_has_are_no_vehicles():
+    range_m = torch.full((1, 8, SENSOR.width), 10.0)
+    sensor = dataclasses.replace(SENSOR, elevation_rad=SENSOR.elevation_rad[:8])
+    for label, count in ((max(CLASSES), 1), (max(CLASSES) + 1, 0), (60_000, 0)):
+        labels = torch.zeros(range_m.shape, dtype=torch.int64)
+        labels[:, 2:6, 20:26] = label
+        image = RangeImage(range_m, range_m > 0, sensor, {"label": labels})
+        assert len(objects_in(image).kind) == count
 
 
 def test_the_statistics_are_those_of_a_loop():

@@ -139,12 +139,6 @@ def _row(score: CompletionScore) -> tuple[str, ...]:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _OfPattern:
-    score: CompletionScore
-    errors_m: list[float]
-
-
 def _check(model: Model, images: RangeImages) -> None:
     if not model.sensor.same_rays(images.sensor):
         raise ConfigError(
@@ -158,7 +152,8 @@ def _check(model: Model, images: RangeImages) -> None:
 
 def _score(
     model: Model, pattern: Pattern, whole: RangeImage, condition: Observed, completions: int, seed: int
-) -> _OfPattern:
+) -> tuple[CompletionScore, list[float]]:
+    """Return how well a model fills in a pattern, and its mean absolute error of each scan in metres."""
     turns = completions if model.generator.is_random else 1
     seeds = [[scan_seed(seed + turn, index) for index in range(len(whole))] for turn in range(turns)]
     begin = time.perf_counter()
@@ -193,20 +188,19 @@ def _score(
         class_iou=_mean_iou(torch.stack(confusions).sum(0)) if confusions else None,
         reflectance_error=Estimate.of(of_reflectance) if bright else None,
     )
-    return _OfPattern(score, errors)
+    return score, errors
 
 
-def _beside(scores: Sequence[_OfPattern]) -> list[CompletionScore]:
+def _beside(scores: Sequence[tuple[CompletionScore, list[float]]]) -> list[CompletionScore]:
     """Add to the scores of one pattern their differences from triangulation's, if that is among them."""
-    base = next((of.errors_m for of in scores if of.score.model == BASELINE), None)
-    found = []
-    for each in scores:
-        if base is None or each.score.model == BASELINE:
-            found.append(each.score)
-            continue
-        difference = Estimate.of([own - its for own, its in zip(each.errors_m, base, strict=True)])
-        found.append(replace(each.score, beside_triangulation_m=difference))
-    return found
+    base = next((errors_m for score, errors_m in scores if score.model == BASELINE), None)
+    if base is None:
+        return [score for score, _ in scores]
+    apart = [Estimate.of([own - its for own, its in zip(errors_m, base, strict=True)]) for _, errors_m in scores]
+    return [
+        score if score.model == BASELINE else replace(score, beside_triangulation_m=difference)
+        for (score, _), difference in zip(scores, apart, strict=True)
+    ]
 
 
 def _error_m(one: RangeImage, other: RangeImage, hidden: Bool[Tensor, "H W"]) -> float:

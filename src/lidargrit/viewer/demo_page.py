@@ -161,7 +161,7 @@ def page(demo: DemoPage) -> str:
         scores=score_table(demo.card),
         run=shlex.quote(str(demo.run)),
     )
-    looks = interactive.style() + asset("report.css") + asset("demo.css")
+    looks = "".join(map(asset, ("page.css", "report.css", "demo.css")))
     title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets())
     script = interactive.opening_script() + "page.turn();\n"
     return document(title, looks, content, script, scans, "data: blob:")

@@ -75,7 +75,7 @@ def page(sets: Sequence[ScanSet]) -> str:
     precision = f"Ranges are kept here in steps of {1000 * coarsest_m:.1f} mm. Written by lidargrit {__version__}."
     title = f"Scans: {', '.join(scans.name for scans in sets)}"
     content = viewer_html({"bin": "Save .bin", "ply": "Save .ply"}, precision, heading="Scans")
-    return document(title, style(), content, opening_script(), as_json(sets), "data: blob:")
+    return document(title, asset("page.css"), content, opening_script(), as_json(sets), "data: blob:")
 
 
 def scripts() -> str:
@@ -91,11 +91,6 @@ def opening_script() -> str:
 def as_json(sets: Sequence[ScanSet]) -> str:
     """Return sets of scans as JSON for an element of a page; no name in them can end that element."""
     return json.dumps(page_data(sets)).replace("<", "\\u003c")
-
-
-def style() -> str:
-    """Return the style sheet of such a page."""
-    return asset("page.css")
 
 
 def viewer_html(buttons: Mapping[str, str], note: str, label: str = "", heading: str = "") -> Markup:

@@ -202,7 +202,9 @@ class Metric(ABC, Generic[Features, Kept]):
         Raises:
             ConfigError: the other was made with other options or fed with images of another kind.
         """
-        self.require_same_options(other)
+        if other.options() != self.options():
+            cure = "make the metric with the same options in every process"
+            raise ConfigError(f"to merge {other.options()}", self.options(), cure)
         if other.kind is None:
             return
         self.require_same_kind(other.kind)
@@ -249,15 +251,9 @@ class Metric(ABC, Generic[Features, Kept]):
         A score of half of the scans then is of the same statistic as that of all.
         """
 
-    def require_same_options(self, other: "Metric[Features, Kept]") -> None:
-        """Refuse to merge with a metric of another kind, variant or seed."""
-        mine, theirs = ((metric.name, metric.variant, metric.seed) for metric in (self, other))
-        if mine != theirs:
-            raise ConfigError(
-                "to merge {} (variant {!r}, seed {})".format(*theirs),
-                "{} (variant {!r}, seed {})".format(*mine),
-                "make the metric with the same options in every process",
-            )
+    def options(self) -> str:
+        """Return what metrics must have in common to be merged, in words."""
+        return f"{self.name} (variant {self.variant!r}, seed {self.seed})"
 
     @final
     def require_same_kind(self, kind: ImageKind) -> None:

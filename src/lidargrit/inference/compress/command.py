@@ -1,7 +1,7 @@
 """A source of scans → one file of compressed range images, and back into a file for each scan."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from lidargrit.inference.complete.inputs import Inputs, ScanReader, open_inputs
 from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
 from lidargrit.inference.compress.coder import not_reproduced
 from lidargrit.inference.compress.drives import DrivesOfSource, Place, PlacedScan, past_of
-from lidargrit.inference.compress.points_command import decompress_points, holds_points
+from lidargrit.inference.compress.points_command import holds_points, reader_of_points
 from lidargrit.inference.compress.scan_codec import ScanCodec
 from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.projection import unproject
@@ -178,9 +178,13 @@ def decompress_scans(path: Path, out: Path, model: str | None, kind: str | None,
         chosen: indices of the scans that are wanted; all if there is none.
     """
     archive = Archive(path)
-    if model and holds_points(archive):
+    is_of_points = holds_points(archive)
+    if model and is_of_points:
         raise UsageError(f"--model {model} for {path}, which holds points", "no model", "leave --model out")
-    kind = kind or ("bin" if holds_points(archive) else IMAGE)
+    kind = kind or ("bin" if is_of_points else IMAGE)
+    if kind == IMAGE and is_of_points:
+        got = f"--format image for {path}, which holds points"
+        raise UsageError(got, "a format of points", "leave --format out, or name bin, pcd, ply or npz")
     form, suffix = (None, ".npy") if kind == IMAGE else writable_format(kind, IMAGE)
     wrong = [index for index in chosen if not 0 <= index < len(archive)]
     if wrong:
@@ -188,24 +192,28 @@ def decompress_scans(path: Path, out: Path, model: str | None, kind: str | None,
         raise UsageError(f"--only {wrong[0]}", wanted, "correct it" if len(archive) else "name another file")
     archive.check()
     indices = list(dict.fromkeys(chosen)) or range(len(archive))
-    if holds_points(archive):
-        return decompress_points(archive, out, kind, indices)
-    codec = _codec_of(archive, model or "pretrained")
-    read = _Drives(archive, codec).read if codec.past_scans else lambda index: codec.decompress(archive.read(index))
+    step_mm, read, sensor = (*reader_of_points(archive), None) if is_of_points else _reader(archive, model)
     names = [archive.names[index] for index in indices]
-    facts = {"source": path.name, "index_crc32": archive.index_crc32}
-    facts |= {"step_mm": codec.steps.step_mm, "format": kind}
+    facts = {"source": path.name, "index_crc32": archive.index_crc32, "step_mm": step_mm, "format": kind}
     folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], [*map(ScanIdentity, names)])
     with folder.writing("decompressing") as progress:
         for number in folder.missing:
-            image, file = read(indices[number]), out / folder.files[number]
-            folder.tell_sensor(codec.sensor)
-            if form is None:
-                write_array(file, image.range_m)
-            else:
-                form.write(file, unproject(image))
+            found, file = read(indices[number]), out / folder.files[number]
+            if sensor is not None:
+                folder.tell_sensor(sensor)
+            if isinstance(found, RangeImage) and form is None:
+                write_array(file, found.range_m)
+            elif form is not None:
+                form.write(file, unproject(found) if isinstance(found, RangeImage) else found)
             progress.advance(1)
     return folder.num_written
+
+
+def _reader(archive: Archive, model: str | None) -> tuple[int, Callable[[int], RangeImage], SensorModel]:
+    """Return the step in millimetres of a file of range images, what reads one by its index, and their sensor."""
+    codec = _codec_of(archive, model or "pretrained")
+    read = _Drives(archive, codec).read if codec.past_scans else lambda index: codec.decompress(archive.read(index))
+    return codec.steps.step_mm, read, codec.sensor
 
 
 class _Drives:

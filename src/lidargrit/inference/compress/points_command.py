@@ -1,6 +1,6 @@
 """A source of scans → one file of compressed points, and back into a file of points for each scan."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -10,7 +10,7 @@ from lidargrit.core.errors import UsageError, no_usable_scan
 from lidargrit.core.untrusted import STEP_MM_AT_MOST
 from lidargrit.core.version import __version__
 from lidargrit.data.prepared.config import DataConfig
-from lidargrit.data.scan_folder import IMAGE, ScanFolder, ScanIdentity, check_names, writable_format
+from lidargrit.data.scan_folder import check_names
 from lidargrit.data.sources import open_source
 from lidargrit.data.sources.named import PointScans, named_scans
 from lidargrit.inference.compress.archive import Archive, Compressed, add_scan, writing
@@ -66,32 +66,19 @@ def holds_points(archive: Archive) -> bool:
     return archive.header.get(_MARK) is True
 
 
-def decompress_points(archive: Archive, out: Path, kind: str, indices: Sequence[int]) -> int:
-    """Write the points of scans of a compressed file, and return the number of scans.
-
-    Args:
-        out: an empty folder, or one that the same command began: files that are there are not written again.
-        kind: name or ending of a format.
-        indices: indices of the scans that are wanted.
-    """
-    if kind == IMAGE:
-        got = f"--format image for {archive.path}, which holds points"
-        raise UsageError(got, "a format of points", "leave --format out, or name bin, pcd, ply or npz")
-    form, suffix = writable_format(kind)
+def reader_of_points(archive: Archive) -> tuple[int, Callable[[int], Scan]]:
+    """Return the step in millimetres of a file of points, and what reads one of its scans by its index."""
     step_mm = archive.header.get("step_mm")
     if not (isinstance(step_mm, int) and 1 <= step_mm <= STEP_MM_AT_MOST):
         raise not_reproduced()
-    codec, names = PointCodec(step_mm), [archive.names[index] for index in indices]
-    facts = {"source": archive.path.name, "index_crc32": archive.index_crc32, "step_mm": step_mm, "format": kind}
-    folder = ScanFolder(out, "decompressed.json", facts, [name + suffix for name in names], [*map(ScanIdentity, names)])
-    with folder.writing("decompressing") as progress:
-        for number in folder.missing:
-            points_m, reflectance = codec.decompress(archive.read(indices[number]))
-            known = None if reflectance is None else torch.from_numpy(reflectance)
-            scan = Scan(torch.from_numpy(points_m), known, source=f"{archive.path}, scan {names[number]}")
-            form.write(out / folder.files[number], scan)
-            progress.advance(1)
-    return folder.num_written
+    codec = PointCodec(step_mm)
+
+    def read(index: int) -> Scan:
+        points_m, reflectance = codec.decompress(archive.read(index))
+        known = None if reflectance is None else torch.from_numpy(reflectance)
+        return Scan(torch.from_numpy(points_m), known, source=f"{archive.path}, scan {archive.names[index]}")
+
+    return step_mm, read
 
 
 def _cloud(scan: Scan) -> Cloud:

@@ -278,4 +278,4 @@ def script() -> str:
 
 def style() -> str:
     """Return the style sheet of the page."""
-    return interactive.style() + asset("serve.css")
+    return asset("page.css") + asset("serve.css")

@@ -7,7 +7,7 @@ from typing import Any, final
 
 import numpy as np
 
-from lidargrit.core.errors import ConfigError, DataError, WeightsError
+from lidargrit.core.errors import DataError, WeightsError
 from lidargrit.data.run_folder import PACKAGED, locate, read_config, weights_sha256
 from lidargrit.evaluation.metrics import FeatureExtractor, Metric
 from lidargrit.evaluation.metrics.shared.accumulators import SumAccumulator
@@ -78,13 +78,9 @@ class LabelMetric(Metric[RangeImage, np.ndarray]):
         return Labelled(self._run, self.device)
 
     @final
-    def require_same_options(self, other: Metric[RangeImage, np.ndarray]) -> None:
-        """Refuse to merge with a metric of another kind, variant, seed or segmenter."""
-        super().require_same_options(other)
-        assert isinstance(other, LabelMetric)
-        if other.weights != self.weights:
-            got, wanted = f"labels by {other.weights} to merge", f"those by {self.weights}"
-            raise ConfigError(got, wanted, "give every process the same segmenter")
+    def options(self) -> str:
+        """Return what metrics must have in common to be merged, the segmenter among it."""
+        return f"{super().options()} of labels by {self.weights or 'the package'}"
 
     def segmenter_details(self) -> dict[str, Any]:
         """Return what identifies the segmenter, for the details of a result."""

@@ -25,7 +25,7 @@ LEAST_RETURNS: Final = 6  # of an object: fewer show neither its length nor its 
 REACH_PIXELS: Final = 2  # rows and columns: a row of a car's windows often does not return
 REACH_M: Final = 1.0  # of range, between two returns of one object: cars park closer than two of these
 _DIRECTIONS = 8  # of the half circle: the longest extent along one of them is at most 2 % too short
-_KIND_OF = torch.zeros(max(CLASSES) + 1, dtype=torch.int64)
+_KIND_OF = torch.zeros(max(CLASSES) + 2, dtype=torch.int64)  # the last stands for all numbers from there on
 for _index, _learned in enumerate(KINDS.values()):
     _KIND_OF[[number for number, each in CLASSES.items() if each.learned in _learned]] = _index + 1
 

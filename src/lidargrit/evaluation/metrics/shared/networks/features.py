@@ -145,16 +145,9 @@ class FeatureMetric(Metric[Float32[np.ndarray, "B d"], Kept]):
         return features
 
     @final
-    def require_same_options(self, other: Metric[Float32[np.ndarray, "B d"], Kept]) -> None:
-        """Refuse to merge with a metric of another kind, variant, seed or weights."""
-        super().require_same_options(other)
-        assert isinstance(other, FeatureMetric)
-        if other.weights_sha256 != self.weights_sha256:
-            raise ConfigError(
-                f"features through other weights ({other.network.path}) to merge",
-                f"those through {self.network.path}",
-                "give every process the same file",
-            )
+    def options(self) -> str:
+        """Return what metrics must have in common to be merged, the weights among it."""
+        return f"{super().options()} through weights of SHA-256 {self.weights_sha256}"
 
     def weights_details(self) -> dict[str, Any]:
         """Return what identifies the weights, for the details of a result."""
