@@ -16,9 +16,10 @@ from lidargrit.evaluation.evaluate import EvalConfig, evaluate_pair, evaluate_so
 from lidargrit.evaluation.intervals import Resampling
 from lidargrit.evaluation.pairs import EvalPair, EvalSet, deviations
 from lidargrit.evaluation.protocols import load_protocol
-from lidargrit.evaluation.tables import side_by_side
+from lidargrit.evaluation.tables import compare_systems, side_by_side
 from lidargrit.scans.sensors import load_sensor
 from seeded_images import SeededImages
+from test_verdict import card, halved
 
 ODOMETRY = load_sensor("hdl64e_kitti_odometry")
 PLAIN = Resampling(halves=0)
@@ -70,6 +71,22 @@ def test_other_definitions_are_told_and_have_no_published_scores_beside_them(tmp
     every = evaluate_pair(as_wanted(), EvalConfig(metrics=("sliced_wasserstein",), resampling=PLAIN))
     assert len(every.scores) == 2
     assert every.deviations == (), "the protocol's own is among them"
+
+
+def test_scores_through_other_weights_are_not_said_to_be_better():
+    def system(value, sha256):
+        rng, metrics = np.random.default_rng(1), ("bev_jsd", "frechet_pointcloud_distance")
+        plain, through = (halved(rng, value, 0, metric) for metric in metrics)
+        details = {"weights": {"file": "w.pth", "sha256": sha256}}
+        return card(plain, replace(through, result=replace(through.result, details=details)))
+
+    alike = compare_systems("b", system(0.5, "1"), "a", system(1.0, "1"))
+    assert "better in 2" in alike.verdict.sentences[0]
+    found = compare_systems("b", system(0.5, "2"), "a", system(1.0, "1"))
+    assert [metric for metric, _ in found.differences] == ["bev_jsd"]
+    tally, remark = found.verdict.sentences
+    assert "better in 1 (bev_jsd), undecided in 1 (frechet_pointcloud_distance)" in tally
+    assert remark == "Scored through other weights of a network, so undecided: frechet_pointcloud_distance."
 
 
 def test_columns_without_a_sensor_are_those_of_prepared_scans(tmp_path):

@@ -380,13 +380,9 @@ def _score(pair: EvalPair, settings: EvalConfig, path: Path) -> None:
 
 def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig) -> bool:
     """Return whether the networks of metrics have weights now that they had not when these scores were computed."""
-    stored: dict[MetricChoice, Any] = {
-        MetricChoice(each.metric, each.variant): None for each in there.left_out if each.verdict != NOT_APPLICABLE
-    }
-    for score in there.scores:
-        weights = score.result.details.get("weights")
-        sha256 = weights.get("sha256") if isinstance(weights, dict) else None
-        stored[MetricChoice(score.result.metric, score.result.variant)] = sha256
+    stored = {MetricChoice(each.metric, each.variant): "" for each in there.left_out if each.verdict != NOT_APPLICABLE}
+    results = [score.result for score in there.scores]
+    stored |= {MetricChoice(each.metric, each.variant): each.weights_sha256 for each in results}
     for choice, sha256 in stored.items():
         if not load_metric(choice.metric).needs_weights:  # what the same program left out of the same images stays so
             continue
@@ -394,6 +390,6 @@ def _has_other_weights(there: Scorecard, pair: EvalPair, settings: EvalConfig) -
             metric = metric_factory(choice, settings)()
             for images, real in ((pair.samples, False), (pair.reference, True)):
                 metric.update(images.batch([0]), real=real)  # some know only now which weights these images need
-            if metric.weights_sha256 != (sha256 or ""):
+            if metric.weights_sha256 != sha256:
                 return True
     return False

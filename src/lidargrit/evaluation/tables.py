@@ -243,7 +243,8 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
     ours, theirs = ({column_of(score): score for score in each.scores} for each in (card, other))
     asked = [*ours, *theirs, *((each.metric, each.variant) for each in (*card.left_out, *other.left_out))]
     names, groups = names_of(asked), _groups_in_common(card, other)
-    shared = [each for each in ours if each in theirs]
+    both = [each for each in ours if each in theirs]
+    shared = [each for each in both if ours[each].result.weights_sha256 == theirs[each].result.weights_sha256]
     differences = {each: _difference(ours[each], theirs[each], groups, len(shared)) for each in shared}
     question = f"Is {name} better than {other_name}?"
     why = too_few(card.reference.scans_used) if card.reference.scans_used < ENOUGH else ""
@@ -261,7 +262,9 @@ def compare_systems(name: str, card: Scorecard, other_name: str, other: Scorecar
     undecided = tuple(name for each, name in names.items() if each not in (*worse, *better))
     lost, won = (tuple(names[each] for each in some) for some in (worse, better))
     tally = Tally(f"{question} {answer}", lost, won, undecided)
-    return Comparison(differences, Verdict((tally,), ()), tuple(worse))
+    apart = ", ".join(names[each] for each in both if each not in shared)
+    remarks = (f"Scored through other weights of a network, so undecided: {apart}.",) if apart else ()
+    return Comparison(differences, Verdict((tally,), remarks), tuple(worse))
 
 
 def _groups_in_common(card: Scorecard, other: Scorecard) -> int:

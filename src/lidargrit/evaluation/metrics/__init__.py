@@ -43,6 +43,12 @@ class MetricResult:
     variant: str
     details: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the weights of the network that the metric looked through; "" without one."""
+        weights = self.details.get("weights")
+        return str(weights.get("sha256", "")) if isinstance(weights, dict) else ""
+
 
 class FeatureExtractor(ABC, Generic[Features]):
     """Turns a batch of range images into what one or several metrics summarise.
