@@ -9,7 +9,7 @@ import torch
 
 from lidargrit.cli import main
 from lidargrit.core.errors import OutputError
-from lidargrit.core.files import write_text
+from lidargrit.core.files import write_json, write_text
 from lidargrit.data.formats.numpy_array import NumpyArray
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.generation.pixel_decoder.phase_network import PixelDecoderConfig
@@ -114,6 +114,23 @@ def test_a_scan_without_a_drop_is_left_out(run, tmp_path, capsys):
     assert complete(run, source, tmp_path / "out", "--observed", "returns", "--bad-scans", "skip") == 0
     assert "00.npz, in which every pixel has a return" in capsys.readouterr().err
     assert sorted(path.name for path in (tmp_path / "out").glob("*.npz")) == ["0.npz", "1.npz"]
+
+
+def test_an_image_that_is_left_out_is_named(tmp_path, capsys):
+    (tmp_path / "images").mkdir()
+    for name, range_m in (("some", wall(SENSOR, 0).range_m), ("full", torch.full((SENSOR.height, SENSOR.width), 9.0))):
+        np.save(tmp_path / "images" / f"{name}.npy", range_m.numpy())
+    write_json(tmp_path / "sensor.json", SENSOR.to_json())
+    words = ["nearest", "--sensor", str(tmp_path / "sensor.json")]
+    source = str(tmp_path / "images")
+    assert main(["complete", source, str(tmp_path / "out"), "--format", "image", "--model", *words]) == 2
+    assert "full.npy, in which every pixel has a return" in capsys.readouterr().err
+    np.save(
+        tmp_path / "images" / "full.npy", np.pad(np.full((1, SENSOR.width), 9, "f4"), ((0, SENSOR.height - 1), (0, 0)))
+    )
+    hides = ["--protocol", "completion", "--observed", "rows:4", "--reference", source, *words[1:]]
+    assert main(["compare", str(tmp_path / "table"), "nearest", *hides]) == 2
+    assert "full.npy, of which --observed rows:4 observes no return" in capsys.readouterr().err
 
 
 def test_a_scan_is_never_called_as_its_return_probabilities_are(run, tmp_path, capsys):

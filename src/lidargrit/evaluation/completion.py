@@ -95,11 +95,11 @@ def compare_completion(
         )
     for model in models:
         _check(model, images)
-    whole = images.batch(range(len(images)))
+    whole, names = images.batch(range(len(images))), images.provenance.names
     scores = []
     with reporting.progress("completing", len(patterns) * len(models)) as progress:
         for pattern in patterns:
-            masks = [pattern.mask(whole[index], derive_seed(seed, index)) for index in range(len(whole))]
+            masks = [pattern.mask(whole[at], derive_seed(seed, at), name) for at, name in enumerate(names)]
             if not bool((whole.return_mask.cpu() & ~torch.stack(masks)).any()):
                 got = f"--observed {pattern.text}, which hides no return of these scans"
                 raise UsageError(got, "pixels that leave some returns out", "observe others, as rows:4")

@@ -45,6 +45,7 @@ class InputScan:
         pixels: row, column and range of every point; None where it was an image.
         by_ring: whether rows are rings.
         grid: rays of the image, as images of a model; None for the image alone.
+        name: what a message calls it where it was an image.
     """
 
     image: RangeImage
@@ -55,6 +56,7 @@ class InputScan:
     pixels: PixelCoordinates | None = None
     by_ring: bool = False
     grid: RayGrid | None = None
+    name: str = "a range image"
 
     @property
     def rays(self) -> RayGrid:
@@ -122,7 +124,7 @@ class Inputs:
                 of the reader's sensor. A range image stays as it is.
         """
         if isinstance(self.scans, ImageScans):
-            return InputScan(self.scans.image(index))
+            return InputScan(self.scans.image(index), name=f"the range image {self.scans.identity(index).name}")
         points = self.scans.scan(index)
         self.scans.tell_notes(points)
         scan = self._reader.read(points) if see is None else see(points)

@@ -51,9 +51,9 @@ class Pattern:
         content = f"{array.shape} {array.dtype}".encode() + array.tobytes()
         return {"observed": self.text, "observed_sha256": hashlib.sha256(content).hexdigest()}
 
-    def mask(self, image: RangeImage, seed: int = 0) -> Bool[Tensor, "H W"]:
+    def mask(self, image: RangeImage, seed: int = 0, source: str = "a scan") -> Bool[Tensor, "H W"]:
         """Return the mask of the observed pixels of one range image; see :meth:`masks`."""
-        return self.masks(RangeImage.stack([image]), seed)[0]
+        return self.masks(RangeImage.stack([image]), seed, source)[0]
 
     def masks(self, images: RangeImage, seed: int = 0, source: str = "a scan") -> Bool[Tensor, "P H W"]:
         """Return the masks of the observed pixels of the images that one scan consists of.

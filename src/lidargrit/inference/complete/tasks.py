@@ -86,7 +86,7 @@ class Fill(Task):
     def condition(self, seen: InputScan, seed: int) -> Observed:
         """Return the pixels that the pattern observes."""
         images = seen.rays.images(seen.image)
-        source = "a range image" if seen.points is None else seen.points.source
+        source = seen.name if seen.points is None else seen.points.source
         return Observed.of_pixels(images, self.pattern.masks(images, seed, source))
 
     def result(self, seen: InputScan, condition: Observed, images: RangeImage) -> CompletedScan:
