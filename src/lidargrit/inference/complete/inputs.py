@@ -45,7 +45,7 @@ class InputScan:
         pixels: row, column and range of every point; None where it was an image.
         by_ring: whether rows are rings.
         grid: rays of the image, as images of a model; None for the image alone.
-        name: what a message calls it where it was an image.
+        name: words by which a message calls a range image; points have a source.
     """
 
     image: RangeImage
