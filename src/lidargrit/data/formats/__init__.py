@@ -92,6 +92,11 @@ class ScanFormat(ABC):
         return cls._has_its_own("write_columns")
 
     @classmethod
+    def keeps_labels(cls, file: str) -> bool:
+        """Return whether a written file of such a name or ending keeps labels."""
+        return "label" in cls.keeps and file.lower().endswith(cls.suffixes[0])
+
+    @classmethod
     def _has_its_own(cls, method: str) -> bool:
         return any(method in base.__dict__ for base in cls.__mro__[: cls.__mro__.index(ScanFormat)])
 

@@ -61,7 +61,7 @@ def write_cloud(path: Path, kind: str, done: CompletedScan, form: type[ScanForma
         if any(quantity_of(name) == "time" for name in more):  # in the file's own name and type
             columns.pop("time", None)
         wanted.write_columns(path, {**more, **columns})
-    return whole.label is None or "label" in wanted.keeps
+    return whole.label is None or wanted.keeps_labels(path.name)
 
 
 def _rows_of_file(done: CompletedScan, rows: FileRows, form: type[ScanFormat]) -> dict[str, np.ndarray]:
