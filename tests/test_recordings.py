@@ -13,10 +13,13 @@ from lidargrit.core.errors import DataError, OutputError, ScanError
 from lidargrit.data.datasets import open_dataset
 from lidargrit.data.export import export_scans
 from lidargrit.data.formats import count_scans, read_scan
+from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.recordings import KINDS, recording_of
 from lidargrit.data.scan_folder import KittiTree
+from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
+from lidargrit.simulator import simulate
 from tiny_runs import contents
 
 TIMES_S, STEP_M = (0.0, 0.15), 2.5
@@ -149,5 +152,16 @@ def test_rerun_reads_both_kinds_back(drives, tmp_path):
 
 
 def test_names_of_scans_tell_their_recording():
-    names = {"00/000012": "00", "a/b/0.bin": "a/b", "drive#3": "drive", "x/drive#3": "x/drive", "000001": "scans"}
+    names = {"00/000012": "00", "a/b/0.bin": "a/b", "drive#3": "drive", "x/drive#3": "x/drive", "000001": "."}
+    names |= {"run#1/000012": "run#1", "a#b/c#d#3": "a#b/c#d", "x/#3": "x"}
     assert {name: recording_of(name) for name in names} == names
+
+
+def test_drives_whose_folders_are_called_alike_are_no_single_recording(tmp_path):
+    scan = simulate(0, load_sensor("vlp16").with_columns(16))
+    for file in ("of/run#1/0.bin", "of/run#2/0.bin", "in/0.bin", "in/scans/0.bin"):
+        KittiBin.write(tmp_path / file, scan)
+    assert export_scans(str(tmp_path / "of"), tmp_path / "out", "mcap") == 2
+    assert sorted(path.name for path in (tmp_path / "out").glob("*.mcap")) == ["run#1.mcap", "run#2.mcap"]
+    with pytest.raises(DataError, match="several scans of .* that would be scans.mcap"):
+        export_scans(str(tmp_path / "in"), tmp_path / "out_of_in", "mcap")

@@ -93,11 +93,12 @@ class _Recordings:
         self._scans, self._read, self._kind, self._config = scans, read, kind, config
         self._drives: dict[str, list[int]] = {}
         for index in range(len(scans)):
-            self._drives.setdefault(f"{recording_of(scans.name(index))}.{kind}", []).append(index)
+            self._drives.setdefault(recording_of(scans.name(index)), []).append(index)
 
     def write(self, out: Path, facts: dict[str, Any]) -> int:
         """Write those that are missing, and return the number of recordings that are there then."""
-        files, drives = [*self._drives], [*self._drives.values()]
+        names = ("scans" if drive == "." else drive for drive in self._drives)
+        files, drives = [f"{name}.{self._kind}" for name in names], [*self._drives.values()]
         each = [[self._scans.identity(index) for index in drive] for drive in drives]
         holds = [ScanIdentity(" ".join(one.name for one in of), "; ".join(one.state for one in of)) for of in each]
         folder = ScanFolder(out, MANIFEST, facts, files, holds, self._config.bad_scans)
@@ -153,7 +154,7 @@ class _Flat:
 
     def __init__(self, out: Path, form: type[ScanFormat], suffix: str) -> None:
         self._out, self._form, self._suffix = out, form, suffix
-        self.keeps_labels, self.sensor = "label" in form.keeps, form.sensor
+        self.keeps_labels, self.sensor = form.keeps_labels(suffix), form.sensor
 
     def files(self, names: list[str]) -> list[str]:
         return [name + self._suffix for name in names]

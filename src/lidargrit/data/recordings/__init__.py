@@ -15,15 +15,15 @@ _FRAME_S = 0.1  # between scans whose times are not known: most lidars turn ten 
 
 
 def recording_of(name: str) -> str:
-    """Return the name of the recording that holds a scan, by the scan's own name: its folder, or its file of several.
+    """Return which recording holds a scan, by the scan's own name: its folder, or its file of several; "." for none.
 
     Example:
         >>> recording_of("00/000012"), recording_of("drive#3"), recording_of("000001")
-        ('00', 'drive', 'scans')
+        ('00', 'drive', '.')
     """
-    file, of_several, _ = name.rpartition("#")
-    folder = file if of_several else str(PurePosixPath(name).parent)
-    return "scans" if folder == "." else folder
+    path = PurePosixPath(name)
+    file, of_several, _ = path.name.rpartition("#")
+    return str(path.with_name(file) if of_several and file else path.parent)
 
 
 def write_recording(path: Path, kind: str, scans: Iterable[Scan]) -> None:
