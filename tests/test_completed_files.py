@@ -190,3 +190,39 @@ def test_points_that_were_added_before_stay_marked(ending, added, tmp_path):
     again = form.read(tmp_path / f"b.{ending}")
     assert again.filled is not None
     assert again.filled.tolist() == [*earlier[kept].tolist(), *[True] * added]
+
+
+@pytest.mark.parametrize("is_own", [True, False])
+def test_intensity_of_a_completed_las_is_what_it_was(tmp_path, is_own):
+    laspy = pytest.importorskip("laspy")
+    scan, las = unproject(street(SIXTEEN)), formats.load("las")
+    las.write(tmp_path / "own.las", scan)
+    (cloud := laspy.read(tmp_path / "own.las")).header.generating_software = "another program"
+    cloud.remove_extra_dim("reflectance")
+    cloud.write(str(tmp_path / "other.las"))
+    read = read_scan(path := tmp_path / ("own.las" if is_own else "other.las"))
+    written = CompletedScan(read, torch.arange(len(read)) > 9, read.select(torch.arange(10)))
+    write_cloud(tmp_path / "out.las", "", written, las)
+    before, after = (laspy.read(each) for each in (path, tmp_path / "out.las"))
+    assert np.array_equal(before.intensity, np.roll(after.intensity, 10))
+    again = read_scan(tmp_path / "out.las")
+    assert torch.equal(again.reflectance.roll(10), read.reflectance)
+    assert again.full_scale == read.full_scale
+
+
+@pytest.mark.parametrize("ending", [".pcd", ".ply", ".las", ".npz"])
+def test_columns_of_rare_types_and_names_are_written(ending, tmp_path):
+    (form,) = formats.candidates(path := tmp_path / f"a{ending}")
+    scan = unproject(street(SIXTEEN))
+    columns = {axis: scan.points_xyz_m[:, at].numpy() for at, axis in enumerate("xyz")}
+    columns |= {"ring": scan.ring.numpy().astype(np.float16), "is_wet": scan.ring.numpy() > 7}
+    columns |= {name: np.arange(len(scan), dtype=np.longdouble) / 3 for name in ("file", "points")}
+    form.write_columns(path, columns)
+    again = read_scan(path)
+    assert torch.equal(again.ring, scan.ring)
+    if ending in {".pcd", ".ply"}:
+        assert np.array_equal(columns_of_file(again)["is_wet"], columns["is_wet"])
+        assert np.array_equal(columns_of_file(again)["file"], columns["file"].astype(np.float64))
+    if ending == ".npz":
+        with np.load(path) as archive:
+            assert np.array_equal(archive["points_"], columns["points"])

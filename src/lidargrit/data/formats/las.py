@@ -19,6 +19,7 @@ from lidargrit.data.formats.shared.columns import (
     ColumnFormat,
     begins_as,
     columns_of,
+    little_endian,
     scan_of_columns,
 )
 from lidargrit.scans.columns import known_name
@@ -34,6 +35,7 @@ _RECORDS_AT_MOST = 1000  # of remarks between header and points; real files have
 _TIME = "gps_time"  # in seconds
 _STEP_M = 1e-4  # in which coordinates are kept: a twentieth of a sensor's own step, and 214 km in 32 bits
 _OURS = "lidargrit"  # the program that writes a file
+_KINDS = [f"{kind}{size}" for kind in "ui" for size in (1, 2, 4, 8)] + ["f4", "f8"]  # of extra dimensions
 _INTENSITY_STEPS = 65_535  # 16 bits, as the standard wants them
 _WRITTEN_ON = date(2000, 1, 1)  # the same scan gives the same bytes on every day
 
@@ -86,7 +88,7 @@ class Las(ColumnFormat):
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write columns to a new file."""
+        """Write columns to a new file; intensity of whole numbers is LAS's own, and any other is reflectance."""
         try:
             import laspy  # noqa: PLC0415  an optional part
         except ImportError:
@@ -98,14 +100,16 @@ class Las(ColumnFormat):
         header = laspy.LasHeader(version="1.4", point_format=1 if _TIME in columns else 0)
         header.scales, header.offsets = np.full(3, _STEP_M), np.zeros(3)
         header.generating_software, header.creation_date = _OURS, _WRITTEN_ON
-        extra = {name: columns[name] for name in ("ring", "label", "filled") if name in columns}
-        if "intensity" in columns:  # the intensity alone does not say what its full scale is
-            extra["reflectance"] = columns["intensity"].astype(np.float32)
+        others = {name: values for name, values in columns.items() if name not in (_TIME, "intensity")}
+        extra = {name: little_endian(values, _KINDS) for name, values in others.items() if known_name(name)}
+        intensity = columns.get("intensity")
+        if intensity is not None and intensity.dtype.kind == "f":  # it alone does not say what its full scale is
+            extra["reflectance"], intensity = intensity.astype(np.float32), _steps(intensity)
         header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()])
         cloud: Any = laspy.LasData(header)
         cloud.xyz = xyz_m
-        if "intensity" in columns:
-            cloud.intensity = _steps(columns["intensity"])
+        if intensity is not None:
+            cloud.intensity = intensity
         if _TIME in columns:
             cloud[_TIME] = columns[_TIME].astype(np.float64)
         for name, values in extra.items():
@@ -123,8 +127,10 @@ def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
         values = np.asarray(points[name])
         if known_name(name) and values.ndim == 1:
             columns[name] = values
-    if ours and "reflectance" in columns and not np.array_equal(intensity, _steps(columns["reflectance"])):
-        del columns["reflectance"]  # of before another program changed the intensity
+    if ours and {"intensity", "reflectance"} <= columns.keys():
+        off = np.abs(intensity - _steps(columns["reflectance"]).astype(np.int64))
+        if off.max() > 1:  # by which points that were added to a file may be rounded
+            del columns["reflectance"]  # of before another program changed the intensity
     return columns
 
 

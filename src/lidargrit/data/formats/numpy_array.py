@@ -19,6 +19,7 @@ from lidargrit.data.formats.shared.filled import marks_file, read_marks, write_m
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an .npy of n rows of 3 to 5 numbers or of named ones, or an .npz with an array points of n rows"
+_OF_SAVEZ = ("file", "allow_pickle", "points")  # names that no further column can have there
 _MAGIC = b"\x93NUMPY"  # of an array alone
 
 
@@ -77,7 +78,8 @@ class NumpyArray(ColumnFormat):
         points = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             if path.suffix.lower() != ".npy":
-                np.savez(file, points=points, **columns)  # pyright: ignore[reportArgumentType]  it fears a column "allow_pickle"
+                named = {f"{name}_" if name in _OF_SAVEZ else name: values for name, values in columns.items()}
+                np.savez(file, points=points, **named)  # pyright: ignore[reportArgumentType]  it fears those names
                 return
             if "ring" in columns:
                 columns.setdefault("intensity", np.zeros(len(points), dtype=np.float32))

@@ -14,6 +14,7 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
     begins_as,
+    little_endian,
     one_word,
     scan_of_columns,
     text_rows,
@@ -25,6 +26,7 @@ _FORMAT = "a PCD file with the fields x, y and z"
 _HEADER_BYTES_AT_MOST = 65_536  # real ones take 200 to 500
 _ROW_BYTES_AT_MOST = 4096  # real ones take 12 to 48; histograms of features up to 1 kB
 _SIZES = {"F": (4, 8), "U": (1, 2, 4, 8), "I": (1, 2, 4, 8)}
+_KINDS = [f"{kind.lower()}{size}" for kind, sizes in _SIZES.items() for size in sizes]
 
 
 class Pcd(ColumnFormat):
@@ -62,14 +64,13 @@ class Pcd(ColumnFormat):
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new binary file."""
-        columns = {one_word(name): _as_written(values) for name, values in columns.items()}
+        columns = {one_word(name): little_endian(values, _KINDS) for name, values in columns.items()}
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
-        kinds = {"f": "F", "u": "U", "i": "I"}
         lines = {
             "VERSION": "0.7",
             "FIELDS": " ".join(columns),
             "SIZE": " ".join(f"{values.dtype.itemsize}" for values in columns.values()),
-            "TYPE": " ".join(kinds[values.dtype.kind] for values in columns.values()),
+            "TYPE": " ".join(values.dtype.kind.upper() for values in columns.values()),
             "COUNT": " ".join("1" for _ in columns),
             "WIDTH": f"{len(rows)}",
             "HEIGHT": "1",
@@ -80,11 +81,6 @@ class Pcd(ColumnFormat):
         header = "".join(f"{key} {words}\n" for key, words in lines.items())
         with atomic_path(path) as temporary:
             temporary.write_bytes(header.encode() + rows.tobytes())
-
-
-def _as_written(values: np.ndarray) -> np.ndarray:
-    """Return numbers in a type and in the byte order that such files have."""
-    return values.astype("<f4" if values.dtype.str[1:] == "f2" else values.dtype.newbyteorder("<"))
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from lidargrit.data.formats.shared.columns import (
     ColumnFormat,
     begins_as,
     check_lines,
+    little_endian,
     one_word,
     plain_text,
     scan_of_columns,
@@ -89,18 +90,13 @@ class Ply(ColumnFormat):
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new binary file; whole numbers of 64 bits, which PLY has not, as doubles."""
-        columns = {one_word(name): _little_endian(values) for name, values in columns.items()}
+        columns = {one_word(name): little_endian(values, _TYPE_NAMES) for name, values in columns.items()}
         lines = [f"property {_TYPE_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
         count = len(next(iter(columns.values())))
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header", ""]
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
         with atomic_path(path) as temporary:
             temporary.write_bytes("\n".join(header).encode() + rows.tobytes())
-
-
-def _little_endian(values: np.ndarray) -> np.ndarray:
-    kind = values.dtype if values.dtype.str[1:] in _TYPE_NAMES else np.dtype("f8")
-    return values.astype(kind.newbyteorder("<"))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 
@@ -83,6 +83,16 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
 def one_word(name: str) -> str:
     """Return the name of a column as headers of text can hold it: blanks and signs between names would make two."""
     return _BETWEEN_NAMES.sub("_", name)
+
+
+def little_endian(values: np.ndarray, kinds: Collection[str]) -> np.ndarray:
+    """Return numbers in a type that a format has and in that order: truth values in bytes, others that lack in doubles.
+
+    Args:
+        kinds: NumPy's names of the format's types, such as "f4".
+    """
+    kind = values.dtype.str[1:]
+    return values.astype(f"<{kind if kind in kinds else 'u1' if kind == 'b1' else 'f8'}")
 
 
 def plain_text(data: bytes) -> bytes:
