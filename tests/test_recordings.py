@@ -163,5 +163,5 @@ def test_drives_whose_folders_are_called_alike_are_no_single_recording(tmp_path)
         KittiBin.write(tmp_path / file, scan)
     assert export_scans(str(tmp_path / "of"), tmp_path / "out", "mcap") == 2
     assert sorted(path.name for path in (tmp_path / "out").glob("*.mcap")) == ["run#1.mcap", "run#2.mcap"]
-    with pytest.raises(DataError, match="several scans of .* that would be scans.mcap"):
+    with pytest.raises(DataError, match=r"several scans of .* that would be scans\.mcap"):
         export_scans(str(tmp_path / "in"), tmp_path / "out_of_in", "mcap")

@@ -95,6 +95,10 @@ def test_the_archive_of_r3dpa_is_read_scan_by_scan(tmp_path):
     write_lidm(whole / "pcd" / "000000.txt", scan(0)[0])
     assert samples_in(whole) == tmp_path
     assert samples_in(whole / "pcd") == whole / "pcd"
+    for named, folder in (("r3dpa", tmp_path), ("lidm", whole / "pcd")):
+        assert samples_in(whole, named) == folder
+        assert open_source(str(whole), samples_format=named).sensor.name == "hdl64e_kitti_360"
+    assert len(open_source(str(tmp_path / "img.npz"), samples_format="r3dpa").images()) == 3
     assert recognise(tmp_path) == "r3dpa"
     images = open_images(str(tmp_path))
     assert len(images) == 3

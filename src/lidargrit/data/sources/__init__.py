@@ -220,7 +220,7 @@ def open_source(text: str, bad_points: BadPoints = "refuse", samples_format: str
             raise DataError(f"{text[:40]!r}, which names no folder ({error})", "a source", "check the path") from None
         folder, here = Path(), False
     if samples_format:
-        return TensorSource(text, folder, samples_format)
+        return TensorSource(text, samples_in(folder, samples_format) or folder, samples_format)
     if here and is_run(folder):
         return RunSource(text, folder)
     if here and is_sample_folder(folder):

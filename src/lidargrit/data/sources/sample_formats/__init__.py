@@ -76,14 +76,11 @@ class SampleFormat:
     suffix: str = ".pth"
     read: Callable[[Path], Tensor] = read_tensor
 
-    def sensor_of(self, rows: int, columns: int) -> SensorModel | None:
-        """Return the sensor that has images of a size, None if there is none."""
-        for name, fine_columns, stride in self.sensors:
-            sensor = load_sensor(name)
-            sensor = sensor.with_columns(fine_columns, stride) if fine_columns else sensor
-            if (sensor.height, sensor.width) == (rows, columns):
-                return sensor
-        return None
+    def by_size(self) -> dict[tuple[int, int], SensorModel]:
+        """Return the possible sensors by the rows and columns of their images."""
+        sensors = [(load_sensor(name), columns, stride) for name, columns, stride in self.sensors]
+        chosen = [sensor.with_columns(columns, stride) if columns else sensor for sensor, columns, stride in sensors]
+        return {(sensor.height, sensor.width): sensor for sensor in chosen}
 
 
 def load_sample_format(name: str) -> SampleFormat:
@@ -104,16 +101,20 @@ def is_tensor_folder(folder: Path) -> bool:
         return False
 
 
-def samples_in(path: Path) -> Path | None:
+def samples_in(path: Path, name: str = "") -> Path | None:
     """Return the folder in which a path holds samples of another program, or None if it holds none.
 
     R3DPA writes pictures, an archive and text into three folders, LiDM pictures and text into two.
+
+    Args:
+        name: name of the wanted sample format; any if empty.
     """
     if path.name == "img.npz" and _holds_images_of_r3dpa(path.parent):
         return path.parent
     if not path.is_dir():
         return None
-    return next((each for each in (path, path / "numpy", path / "pcd") if is_tensor_folder(each)), None)
+    folders, suffix = (path, path / "numpy", path / "pcd"), load_sample_format(name).suffix if name else ""
+    return next((each for each in folders if (_files(each, suffix) if name else is_tensor_folder(each))), None)
 
 
 def recognise(folder: Path) -> str:
@@ -204,20 +205,11 @@ class _Tensors:
 def _sensor_of(first: Tensor, path: Path, form: SampleFormat) -> SensorModel:
     """Return the sensor whose images are as large as the tensor of a folder's first file."""
     shape = tuple(first.shape)
-    fits = len(shape) in {3, 4} and shape[-3] == form.channels
-    sensor = form.sensor_of(*shape[-2:]) if fits else None
-    if sensor is None:
-        sizes = " or ".join(f"{form.channels}x{h}x{w}" for h, w in _sizes(form))
+    fits, known = len(shape) in {3, 4} and shape[-3] == form.channels, form.by_size()
+    if not fits or shape[-2:] not in known:
+        sizes = " or ".join(f"{form.channels}x{h}x{w}" for h, w in known)
         raise ScanError(f"a tensor of {shape} in {path}", f"{sizes}: {form.title}", "check the format")
-    return sensor
-
-
-def _sizes(form: SampleFormat) -> list[tuple[int, int]]:
-    found = []
-    for name, fine_columns, stride in form.sensors:
-        sensor = load_sensor(name)
-        found.append((sensor.height, fine_columns // stride if fine_columns else sensor.width))
-    return found
+    return known[shape[-2:]]
 
 
 def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -225,10 +217,13 @@ def _array(values: Tensor) -> np.ndarray[Any, np.dtype[np.float32]]:
 
 
 def _paths(folder: Path, suffix: str = ".pth") -> list[Path]:
-    found = sorted(folder.glob(f"[!.]*{suffix}"), key=_order)
-    if not found:
+    if not (found := _files(folder, suffix)):
         raise DataError(f"no {suffix} file in {folder}", "samples, in files of their own", "check the folder")
     return found
+
+
+def _files(folder: Path, suffix: str) -> list[Path]:
+    return sorted(folder.glob(f"[!.]*{suffix}"), key=_order)
 
 
 def _holds_points_without_colour(folder: Path) -> bool:
