@@ -143,6 +143,16 @@ def test_nuscenes_has_poses_in_its_tables(tmp_path):
         x, y, z = seen  # of a file x is to the right, y ahead
         in_file = np.array([-y, x, z, 1])
         assert np.allclose(pose @ sensor_on_car() @ in_file, CORNER_M)
+    here = scans.motion(0).pose
+    (tables / "ego_pose.json").write_text(
+        json.dumps([posed(f"e{n}", 2 * np.eye(4) - pose) for n, pose in enumerate(poses)])
+    )
+    assert not torch.equal(here, scans.motion(0).pose), "the tables are read again where they change"
+    (tables / "ego_pose.json").write_text(
+        json.dumps([posed("e0", poses[0]) | {"translation": None}, posed("e1", poses[1])])
+    )
+    with pytest.raises(DataError, match="whose poses cannot be used"):
+        scans.motion(0)
 
 
 def test_argoverse_2_has_the_poses_of_its_car(tmp_path):

@@ -5,6 +5,7 @@ The libraries want packages that clash with ours, so these tests run in environm
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import torch
 from lidargrit.cli import main
 from lidargrit.core.errors import DataError
 from lidargrit.data.datasets import open_dataset, recognise
+from lidargrit.data.datasets.ncore import Ncore
 
 ROWS, COLUMNS, TURN_US = 8, 12, 100_000
 TURNED, PLACE_M = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 0.0, 1.8])  # of a LiDAR on a vehicle
@@ -139,6 +141,18 @@ def test_a_log_of_py123d_is_read_as_its_library_wrote_it(tmp_path):
     write_123d(tmp_path / "paths", holds_points=False)
     with pytest.raises(DataError, match=r"names files in place of points.*lidar_store_option: binary"):
         open_dataset(f"py123d:{tmp_path / 'paths'}")
+
+
+def test_all_files_of_a_drive_of_ncore_are_opened_whatever_its_name(tmp_path, monkeypatch):
+    opened = []
+    fake = SimpleNamespace(SequenceComponentGroupsReader=lambda files, **_: opened.extend(files) or 1 / 0)
+    monkeypatch.setitem(sys.modules, "ncore.data.v4", fake)
+    names = ["drive [1].ncore4-lidar.zarr.itar", "drive [1].ncore4.zarr.itar"]
+    for name in (*names, "drive 1.ncore4.zarr.itar"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(DataError, match="nvidia-ncore cannot read"):
+        Ncore.scans_in(tmp_path / names[1])
+    assert [path.name for path in opened] == names
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """NVIDIA NCore 4: ROOT/NAME.ncore4*.zarr.itar → scans of the first LiDAR with rows, times and poses."""
 
 from dataclasses import replace
+from glob import escape
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,10 +41,9 @@ class Ncore(LibraryDataset):
     library = "nvidia-ncore"
     patterns = ("*.ncore4*.zarr.itar", "*/*.ncore4*.zarr.itar")
 
-    @classmethod
-    def _find(cls, root: Path) -> list[Path]:
+    def _find(self) -> list[Path]:
         """Return one file of each drive, which may have several."""
-        first = {(path.parent, _drive_of(path)): path for path in reversed(super()._find(root))}
+        first = {(path.parent, _drive_of(path)): path for path in reversed(super()._find())}
         return natural_order(first.values())
 
     @classmethod
@@ -65,7 +65,7 @@ class NcoreDrive:
 
     def __init__(self, path: Path) -> None:
         ncore: ModuleType = import_module("ncore.data.v4")
-        files = natural_order(path.parent.glob(f"{_drive_of(path)}{_MARK}*.zarr.itar"))
+        files = natural_order(path.parent.glob(f"{escape(_drive_of(path))}{_MARK}*.zarr.itar"))
         reader: Any = ncore.SequenceComponentGroupsReader(files, max_threads=1)
         drive: Any = ncore.SequenceLoaderV4(reader, masks_component_group_name=None, cuboids_component_group_name=None)
         if not drive.lidar_ids:

@@ -4,7 +4,7 @@ import json
 import re
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
+from itertools import chain
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from lidargrit.core.errors import DataError, LidarGritError, first_words
-from lidargrit.core.files import read_json
+from lidargrit.core.files import read_json, remembered
 from lidargrit.data import formats
 from lidargrit.data.datasets import SplitScheme
 from lidargrit.data.datasets.shared.files import FileDataset, unnamed_recording
@@ -120,9 +120,8 @@ class Nuscenes(FileDataset):
         log, _ = _log_and_time(path)
         return unnamed_recording(path) if log == "." else f"nuscenes/{log}"
 
-    @classmethod
-    def _find(cls, root: Path) -> list[Path]:
-        return sorted(super()._find(root), key=lambda path: path.name)  # both folders together in the order of time
+    def _find(self) -> list[Path]:
+        return sorted(super()._find(), key=lambda path: path.name)  # both folders together in the order of time
 
     def _none_of(self, split: Split, sequences: set[str], wanted: list[str]) -> DataError:
         if self._scenes_of_log or not wanted[0].startswith("scene-"):
@@ -167,23 +166,24 @@ def _read_table(path: Path) -> list[dict[str, Any]]:
     return read_json(path, list, DataError, "a table of nuScenes", "unpack it again", _TABLE_BYTES_AT_MOST)
 
 
-@lru_cache(maxsize=4)
+def _tables_of_poses(root: Path) -> list[list[Path]]:
+    names = ("sample_data.json", "ego_pose.json", "calibrated_sensor.json")
+    return [[table.with_name(name) for name in names] for table in sorted(root.glob("v1.0-*/sample_data.json"))]
+
+
+@remembered(lambda root: chain.from_iterable(_tables_of_poses(root)), at_most=4)
 def _poses(root: Path) -> dict[str, Float64[np.ndarray, "4 4"]]:
     """Return the pose of LIDAR_TOP at each scan by its file's name; none without the tables.
 
     Those of the whole data set have 2 GB: they are read row by row, and rows of cameras and radars left out.
     """
     found = dict[str, Float64[np.ndarray, "4 4"]]()
-    for table in sorted(root.glob("v1.0-*/sample_data.json")):
+    for table, *of_poses in _tables_of_poses(root):
         try:
             scans = [row for row in _rows(table) if "/LIDAR_TOP/" in row["filename"]]
             wanted = {row[name] for row in scans for name in ("ego_pose_token", "calibrated_sensor_token")}
-            poses = {
-                row["token"]: _matrix(row)
-                for name in ("ego_pose.json", "calibrated_sensor.json")
-                for row in _rows(table.with_name(name))
-                if row["token"] in wanted
-            }
+            rows = (row for of in of_poses for row in _rows(of) if row["token"] in wanted)
+            poses = {row["token"]: _matrix(row) for row in rows}
             for row in scans:
                 pose = poses[row["ego_pose_token"]] @ poses[row["calibrated_sensor_token"]] @ _FILE_FROM_SENSOR
                 found[Path(row["filename"]).name] = pose
@@ -203,4 +203,7 @@ def _rows(table: Path) -> Iterator[dict[str, Any]]:
 
 def _matrix(row: dict[str, Any]) -> Float64[np.ndarray, "4 4"]:
     w, x, y, z = row["rotation"]
-    return as_poses(Rotation.from_quat((x, y, z, w)).as_matrix(), np.array(row["translation"], np.float64))
+    pose = as_poses(Rotation.from_quat((x, y, z, w)).as_matrix(), np.array(row["translation"], np.float64))
+    if not np.isfinite(pose).all():
+        raise ValueError("a number that is not finite")
+    return pose
