@@ -33,6 +33,16 @@ def picture(path):
     Image.fromarray(np.full((48, 64, 3), 128, np.uint8)).save(path)
 
 
+def test_hidden_folders_are_not_looked_into_and_a_name_may_be_as_long_as_names_can_be(tmp_path):
+    write_bin(tmp_path / f"sequences/00/velodyne/{'a' * 251}.bin")
+    (tmp_path / ".git").mkdir()
+    (tmp_path / ".git/objects.zip").write_bytes(b"PK")
+    for source in (f"folder:{tmp_path}", f"kitti_odometry:{tmp_path}"):
+        dataset = open_dataset(source)
+        assert dataset.notes == ()
+        assert len(dataset.scan(0)) == len(TABLE["x"])
+
+
 def test_pictures_poses_and_labels_beside_scans_are_none(tmp_path, capsys):
     write_bin(tmp_path / "scans/b.bin")
     picture(tmp_path / "scans/a.png")

@@ -263,7 +263,8 @@ def files_of_others(root: Path) -> tuple[str, str] | None:
     counted: Counter[str] = Counter()
     cures: dict[str, str] = {}
     for path in islice(root.rglob("*"), _FILES_TO_LOOK_AT):
-        if not path.name.startswith(".") and formats.is_of_other_program(path) and path.is_file():
+        is_hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
+        if not is_hidden and formats.is_of_other_program(path) and path.is_file():
             ending = printable("".join(path.suffixes[-2:]) if path.suffix in _PACKED else path.suffix)[:20]
             counted[ending] += 1
             cures[ending] = formats.cure_of_ending(path)

@@ -1,7 +1,7 @@
 """Your own scans, in any format that is known and several at once: ROOT/** → scans."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from lidargrit.core.determinism import natural_order
@@ -42,11 +42,21 @@ class Folder(FileDataset):
         if found:
             self.topic, split = found[1], f"all{found[2] or ''}"
         super().__init__(root, split, bad_points)
-        self.notes = _left_out(root, len({path for path, _ in self._scans}))
+        self.notes = tuple(self._left_out())
         sensors = [one.sensor for one in formats.candidates(self.path(0)) if one.sensor]
         self.sensor = self._sensor_beside()
         if sensors and self.sensor == type(self).sensor:
             self.sensor = sensors[0]
+
+    def _left_out(self) -> Iterator[str]:
+        """Yield notes on files that are no scans, or not read."""
+        if beside := self._beside:
+            what = f"{len(beside):,} {'file' if len(beside) == 1 else 'files'}"
+            endings = ", ".join(sorted({path.suffix.lower() for path in beside}))
+            yield f"{what} {endings} beside the scans left out, such as {printable(beside[0].name)[:80]}"
+        if self.root.is_dir() and (others := files_of_others(self.root)):
+            count = len({path for path, _ in self._scans})
+            yield f"{others[0]} beside {count:,} that are read left out; {others[1]}"
 
     def takes_files_in(self, folder: Path) -> bool:
         """Return whether a folder is the root or lies below it, at whatever depth."""
@@ -57,9 +67,9 @@ class Folder(FileDataset):
         """Return whether a folder holds a file with the ending of a scan, or a single file has one."""
         return next(scans_below(root), None) is not None
 
-    @classmethod
-    def _find(cls, root: Path) -> list[Path]:
-        return natural_order(_without_sidecar_files(scans_below(root))[0])
+    def _find(self) -> list[Path]:
+        scans, self._beside = _without_sidecar_files(scans_below(self.root))
+        return natural_order(scans)
 
     def scan(self, index: int) -> Scan:
         """Read one scan, with SemanticKITTI's labels if it lies in a sequence that has them."""
@@ -108,20 +118,3 @@ def _without_sidecar_files(found: Iterable[Path]) -> tuple[list[Path], list[Path
 def is_points(path: Path) -> bool:
     """Return whether a file that is called like a scan, and may be something else, looks like one."""
     return is_recognised(path) and (path.suffix.lower() != ".npy" or holds_points(path))
-
-
-def _left_out(root: Path, count: int) -> tuple[str, ...]:
-    """Return notes on files of a folder that are no scans, or not read."""
-    if not root.is_dir():
-        return ()
-    beside = _without_sidecar_files(scans_below(root))[1]
-    endings = ", ".join(sorted({path.suffix.lower() for path in beside}))
-    example = f"such as {printable(beside[0].name)[:80]}" if beside else ""
-    notes = (
-        [f"{len(beside):,} {'file' if len(beside) == 1 else 'files'} {endings} beside the scans left out, {example}"]
-        if beside
-        else []
-    )
-    if others := files_of_others(root):
-        notes.append(f"{others[0]} beside {count:,} that are read left out; {others[1]}")
-    return tuple(notes)

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Protocol, runtime_checkable
 from urllib.parse import quote
 
 from lidargrit.core.errors import ScanError, printable
-from lidargrit.core.files import remembered
+from lidargrit.core.files import remembered, state_of
 from lidargrit.data.formats import BadPoints, ScanFormat, damaged, first_bytes, open_file
 from lidargrit.data.formats.shared.columns import BYTES_AT_MOST, REFLECTANCE_RULE, scan_of_columns
 from lidargrit.data.formats.shared.mcap import (
@@ -247,7 +247,7 @@ class _Sqlite:
     def __init__(self, path: Path, topic: str) -> None:
         self._path = path
         log = path.with_name(f"{path.name}-wal")
-        if log.is_file() and log.stat().st_size:
+        if (state := state_of(log)) and state[0]:
             what = f"{path}, whose last messages lie in {log.name}: the recorder did not close it"
             raise ScanError(what, "a closed recording", f"sqlite3 {path.name} 'PRAGMA wal_checkpoint(TRUNCATE)'")
         topics: Counter[str] = Counter()

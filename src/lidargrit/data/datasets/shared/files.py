@@ -70,7 +70,7 @@ class FileDataset(ScanDataset):
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)
-        found = {path: self.sequence_of(path.relative_to(root)) for path in self._find(root)}
+        found = {path: self.sequence_of(path.relative_to(root)) for path in self._find()}
         if not found:
             raise self._wrong_root()
         _check_names(found)
@@ -224,11 +224,10 @@ class FileDataset(ScanDataset):
         own = {*root.glob(pattern)}
         return any(is_recognised(path) for path in scans_below(root) if path not in own)
 
-    @classmethod
-    def _find(cls, root: Path) -> list[Path]:
-        for pattern in cls.patterns:
-            _check_readable(root, pattern)
-            if found := natural_order(filter(_is_scan_file, root.glob(pattern))):
+    def _find(self) -> list[Path]:
+        for pattern in self.patterns:
+            _check_readable(self.root, pattern)
+            if found := natural_order(filter(_is_scan_file, self.root.glob(pattern))):
                 return found
         return []
 

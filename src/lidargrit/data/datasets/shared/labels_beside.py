@@ -1,5 +1,6 @@
 """Labels of SemanticKITTI beside a scan: folder/velodyne/NAME.bin → folder/labels/NAME.label → the scan with labels."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def with_labels(scan: Scan, path: Path) -> Scan:
     Source:
         Behley et al., SemanticKITTI, ICCV 2019.
     """
-    if not (labels := label_file(path)).is_file():
+    if not os.path.isfile(labels := label_file(path)):  # False, too, where its name would be too long
         return scan
     assert scan.rows is not None  # as of all files of KITTI's format
     data = read_bytes(labels, _LABEL_BYTES_AT_MOST, _LABELS)

@@ -1,5 +1,6 @@
 """``NAME.filled`` beside a file of points without room for it: one byte a point, 1 where a model added the point."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ def marks_file(path: Path) -> Path:
 def read_marks(path: Path, count: int) -> Bool[Tensor, "n"] | None:
     """Return which points of a file a model added; None where no marks lie beside it."""
     beside = marks_file(path)
-    if not beside.is_file():
+    if not os.path.isfile(beside):  # False, too, where its name would be too long
         return None
     wanted = f"a byte of 0 or 1 for each of the {count:,} points in {path.name}"
     marks = np.frombuffer(formats.read_bytes(beside, formats.POINTS_AT_MOST, wanted), np.uint8)
