@@ -15,9 +15,9 @@ import torch
 from PIL import Image
 
 import lidargrit
+from dataset_examples import write_example
 from lidargrit.cli import build_parser, main
 from lidargrit.core import discovery
-from lidargrit.data.datasets import load
 from lidargrit.data.formats import read_scan as read_bin
 from lidargrit.data.sources.samples import read_samples
 from lidargrit.evaluation.evaluate import EvalConfig
@@ -333,7 +333,7 @@ def test_python_and_the_command_line_do_the_same(run_folder, samples):
 
 
 def test_load_scan_reads_what_the_example_wrote(tmp_path):
-    load("folder").write_example(tmp_path, 1)
+    write_example("folder", tmp_path, 1)
     assert len(lidargrit.load_scan(tmp_path / "000000.bin")) == len(read_bin(tmp_path / "000000.bin"))
 
 

@@ -9,10 +9,10 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
+from dataset_examples import write_example
 from lidargrit.cli import main
 from lidargrit.core.errors import ConfigError, LidarGritError, OutputError
 from lidargrit.core.files import claim_folder
-from lidargrit.data.datasets import load
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
 from lidargrit.evaluation import compare
@@ -149,7 +149,7 @@ def test_the_reference_is_projected_once_for_all_systems_of_a_sensor(tmp_path, m
 
 
 def test_bounds_of_another_data_set_are_warned_of(tmp_path, capsys):
-    load("kitti_odometry").write_example(tmp_path / "real", 2)
+    write_example("kitti_odometry", tmp_path / "real", 2)
     words = ["-n", "2", "--metrics", "bev_jsd", "--reference", str(tmp_path / "real")]
     assert main(["compare", str(tmp_path / "table"), "marginal", "memorised", *words, "--set", *FEW]) == 0
     (line,) = (line for line in capsys.readouterr().err.splitlines() if "bound no score" in line)

@@ -9,12 +9,12 @@ import pytest
 import torch
 from PIL import Image
 
+from dataset_examples import write_example
 from format_examples import NAMES, can_write, written
-from lidargrit.core.errors import DataError, OutputError, ScanError, UnknownNameError
+from lidargrit.core.errors import DataError, ScanError, UnknownNameError
 from lidargrit.core.files import write_json
 from lidargrit.data import formats
 from lidargrit.data.datasets import ScanDataset, load, open_dataset
-from lidargrit.data.datasets.folder import Folder
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images, open_source
 from lidargrit.scans.projection import project
@@ -85,7 +85,7 @@ def test_a_root_of_another_layout_is_told_how_to_open_it(bin_file, tmp_path):
 
 
 def test_a_share_of_a_folder_of_the_current_one(tmp_path, monkeypatch):
-    Folder.write_example(tmp_path / "scans", 4)
+    write_example("folder", tmp_path / "scans", 4)
     monkeypatch.chdir(tmp_path)
     for source in ("scans[:50%]", "./scans[:50%]", "scans:all[:50%]", "folder:scans[:50%]"):
         assert len(open_dataset(source)) == 2
@@ -126,8 +126,7 @@ def test_links_to_folders_are_followed_once_and_not_around(bin_file, tmp_path):
 
 @pytest.mark.parametrize("name", ["range_images", "nuscenes"])
 def test_a_folder_of_one_format_with_more_below_is_read_whole(name, tmp_path):
-    dataset = load(name)
-    dataset.write_example(tmp_path / "tree", 2)
+    write_example(name, tmp_path / "tree", 2)
     first, second = sorted(path for path in (tmp_path / "tree").rglob("*") if path.is_file())
     (tmp_path / "mine" / "day2").mkdir(parents=True)
     first.rename(tmp_path / "mine" / first.name)
@@ -137,7 +136,7 @@ def test_a_folder_of_one_format_with_more_below_is_read_whole(name, tmp_path):
 
 
 def test_drives_that_may_not_be_read_are_not_passed_over(tmp_path, monkeypatch):
-    load("kitti_odometry").write_example(tmp_path, 2)
+    write_example("kitti_odometry", tmp_path, 2)
     locked = tmp_path / "sequences" / "08"
     monkeypatch.setattr("os.access", lambda path, mode: Path(path) != locked)  # whoever runs the tests may read all
     with pytest.raises(DataError, match="sequences/08, which cannot be read"):
@@ -214,13 +213,6 @@ def test_one_bad_file_among_others_is_told_by_its_name_and_left_out(tmp_path, mo
     assert str(folder / "bad.ply") in left_out
     lacking = f"WARNING: no reflectance in 1 of 5 scans, such as {folder / 'xyz_bin.bin'}, so that no scan is read with"
     assert any(message.startswith(lacking) for message in heard)
-
-
-def test_an_example_overwrites_nothing(bin_file, tmp_path):
-    path = bin_file(ROWS)
-    with pytest.raises(OutputError, match=r"000000\.bin, which exists"):
-        load("folder").write_example(tmp_path, 1)
-    assert path.stat().st_size == ROWS.nbytes
 
 
 def test_simulated_splits_share_no_seed():

@@ -2,8 +2,8 @@
 
 import shutil
 
+from dataset_examples import write_example
 from lidargrit.core import reporting
-from lidargrit.data.datasets import load
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.settings import Preset
 from lidargrit.systems.lidargrit.system import TokenSampling
@@ -33,7 +33,7 @@ def test_demo_takes_the_preset_that_suits_the_scans(tmp_path, capsys, monkeypatc
         assert words == "The tokenizer, the transformer and the pixel decoder learn anew here."
         assert ("another sensor" in said) != anew
         assert demo._sampling(preset) == demo._SHARPER
-    load("kitti_odometry").write_example(tmp_path / "tree", 1)
+    write_example("kitti_odometry", tmp_path / "tree", 1)
     (scan,) = (tmp_path / "tree" / "sequences" / "00" / "velodyne").iterdir()
     for number in range(1, 4):
         shutil.copy(scan, scan.with_stem(f"{number:06d}"))

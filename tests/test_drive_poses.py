@@ -8,8 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from dataset_examples import write_example
 from lidargrit.core.errors import DataError
-from lidargrit.data.datasets import ScanDataset, load, open_dataset
+from lidargrit.data.datasets import ScanDataset, open_dataset
 from lidargrit.data.datasets.shared.odometry import motions
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
@@ -178,7 +179,7 @@ def test_argoverse_2_has_the_poses_of_its_car(tmp_path):
 @pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, np.nan), None])
 def test_damaged_poses_of_argoverse_2_are_refused_where_poses_are_needed(quaternion, tmp_path):
     feather, arrow = pytest.importorskip("pyarrow.feather"), pytest.importorskip("pyarrow")
-    load("argoverse2").write_example(tmp_path, 1)
+    write_example("argoverse2", tmp_path, 1)
     file = next((tmp_path / "train").iterdir()) / "city_SE3_egovehicle.feather"
     if quaternion is None:
         file.write_bytes(b"no poses")

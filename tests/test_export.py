@@ -324,13 +324,10 @@ def test_the_command(samples, tmp_path, capsys):
     assert "wanted an empty folder" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("kind", "told"),
-    [("bin", [".bin keeps no labels"]), ("npy", [".npy keeps no labels"]), ("npz", []), ("kitti_odometry", [])],
-)
+@pytest.mark.parametrize(("kind", "told"), [("bin", 1), ("npy", 1), ("npz", 0), ("kitti_odometry", 0)])
 def test_labels_that_a_format_does_not_keep_are_told_once(streets, tmp_path, kind, told, heard):
     export_scans(streets, tmp_path, kind, DataConfig(max_scans=2))
-    assert [text.partition(";")[0] for text in heard] == told
+    assert [text.partition(";")[0] for text in heard] == [f".{kind} keeps no labels"] * told
 
 
 def poses_of(source):

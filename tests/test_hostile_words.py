@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from lidargrit.data.datasets import load
+from dataset_examples import write_example
 from tiny_runs import the_one_line
 
 ASCII = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
@@ -39,7 +39,7 @@ MISSING = ["straße.bin".encode(), "走.json".encode(), b"\xff.bin", b"x" * 300]
 
 def test_files_with_such_names_are_used_under_the_c_locale_or_told_in_one_line(tmp_path):
     """German and Chinese: a scan and its folder, and files that are missing."""
-    load("folder").write_example(tmp_path / "scans", 1)
+    write_example("folder", tmp_path / "scans", 1)
     (tmp_path / "scans" / "000000.bin").rename(tmp_path / "scans" / "straße.bin")
     (tmp_path / "scans").rename(tmp_path / "走")
     words = ["-c", REFUSED_THEN_USED, "走".encode()]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from dataset_examples import write_example
 from lidargrit.core.errors import ConfigError, DataError, OutputError, ScanError
 from lidargrit.data.batches import Batches
 from lidargrit.data.datasets import open_dataset
@@ -41,7 +42,7 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def whole_tree(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "tree"
-    KittiOdometry.write_example(folder, 5)
+    write_example("kitti_odometry", folder, 5)
     return folder
 
 

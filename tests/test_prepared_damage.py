@@ -12,6 +12,7 @@ import pytest
 import torch
 from google_crc32c import value as crc32c
 
+from dataset_examples import write_example
 from lidargrit.core.errors import DataError, OutputError, ScanError
 from lidargrit.core.files import claim_folder
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
@@ -211,7 +212,7 @@ def test_a_sensor_that_is_none_is_told_with_its_file(folder):
 
 def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
     tree = tmp_path / "tree"
-    KittiOdometry.write_example(tree, 5)
+    write_example("kitti_odometry", tree, 5)
     KittiOdometry(tree).path(3).write_bytes(b"")
     config = DataConfig(workers=1)
     with pytest.raises(ScanError, match=r"--bad-scans skip"):
@@ -226,7 +227,7 @@ def test_a_folder_goes_on_with_what_its_refusal_advised(tmp_path, small_shards):
 
 def test_a_preparation_that_made_nothing_leaves_its_folder_free(tmp_path, monkeypatch):
     tree, out = tmp_path / "tree", tmp_path / "out"
-    KittiOdometry.write_example(tree, 2)
+    write_example("kitti_odometry", tree, 2)
     good = KittiOdometry(tree).path(0).read_bytes()
     KittiOdometry(tree).path(0).write_bytes(good[:-3])
     with pytest.raises(ScanError, match="download it again"):
@@ -253,7 +254,7 @@ def test_a_preparation_that_made_nothing_leaves_its_folder_free(tmp_path, monkey
 
 def test_scans_that_were_left_out_do_not_come_back_unseen(tmp_path, small_shards):
     tree, out = tmp_path / "tree", tmp_path / "out"
-    KittiOdometry.write_example(tree, 4)
+    write_example("kitti_odometry", tree, 4)
     path = KittiOdometry(tree).path(2)
     points = np.fromfile(path, "<f4")
     points[:3] = 0
@@ -268,7 +269,7 @@ def test_scans_that_were_left_out_do_not_come_back_unseen(tmp_path, small_shards
 
 def test_a_link_to_nothing_is_left_out_where_bad_scans_are(tmp_path):
     tree = tmp_path / "tree"
-    KittiOdometry.write_example(tree, 2)
+    write_example("kitti_odometry", tree, 2)
     path = KittiOdometry(tree).path(0)
     (path.parent / "000007.bin").symlink_to(tmp_path / "nothing.bin")
     with pytest.raises(DataError, match=r"000007\.bin, which cannot be read"):

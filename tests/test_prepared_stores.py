@@ -13,8 +13,8 @@ import torch
 import xarray
 import zarr
 
+from dataset_examples import write_example
 from lidargrit.core.errors import DataError, ScanError
-from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.arrays import store_context, store_of
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.prepared.prepare import prepare
@@ -28,7 +28,7 @@ SIMULATED = DataConfig(workers=1)
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "tree"
-    KittiOdometry.write_example(folder, 5)
+    write_example("kitti_odometry", folder, 5)
     return folder
 
 

@@ -15,12 +15,12 @@ import yaml
 from PIL import Image
 
 import lidargrit
+from dataset_examples import write_example
 from lidargrit.cli import main
 from lidargrit.core import configuration
 from lidargrit.core.files import sha256_of_json, write_json
-from lidargrit.data.datasets import data_set_and_split, load, open_dataset
+from lidargrit.data.datasets import data_set_and_split, open_dataset
 from lidargrit.data.datasets import folder as folder_of_scans
-from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.datasets.shared import files as _files
 from lidargrit.data.images import Provenance
 from lidargrit.data.sources import data_set_of
@@ -40,7 +40,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("private_place")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LIDARGRIT_CACHE", str(folder / "cache"))
-        load("kitti_odometry").write_example(folder / "data", 4)
+        write_example("kitti_odometry", folder / "data", 4)
         sources = [f"data.train=[kitti_odometry:{folder / 'data'}:train]", f"data.val=[{folder / 'data'}:08]"]
         assert main(["train", "lidargrit_demo", str(folder / "run"), "--set", *MODEL, *SHORT, *sources]) == 0
         assert main(["sample", str(folder / "run"), str(folder / "samples"), "-n", "3"]) == 0
@@ -351,7 +351,7 @@ def test_the_name_of_a_source_is_not_worth_a_walk_through_a_disk(tmp_path, monke
     monkeypatch.setattr(_files, "scans_below", walked)
     monkeypatch.setattr(folder_of_scans, "scans_below", walked)
     assert data_set_of(str(tmp_path)) == ("folder", "all")
-    KittiOdometry.write_example(tmp_path, 1)
+    write_example("kitti_odometry", tmp_path, 1)
     assert data_set_of(str(tmp_path)) == ("kitti_odometry", "all")
 
 

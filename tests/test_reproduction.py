@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
+from dataset_examples import write_example
 from lidargrit.cli import main
 from lidargrit.core import configuration
 from lidargrit.core.errors import ConfigError
-from lidargrit.data.datasets import load
 from lidargrit.evaluation.protocols import load_protocol
 from lidargrit.evaluation.reproduction import TABLES, Reproduction, prepare
 from lidargrit.evaluation.tables import published
@@ -58,7 +58,7 @@ def test_images_are_those_that_the_protocol_wants(number):
 def test_a_plan_tells_scans_and_cost(tmp_path, capsys, monkeypatch):
     told_at_once = lambda preset: dict.fromkeys(preset.training, 10**18)  # noqa: E731
     monkeypatch.setattr(sys.modules["lidargrit.training.plan"], "training_flops", told_at_once)
-    load("kitti_360").write_example(tmp_path / "root", 1)
+    write_example("kitti_360", tmp_path / "root", 1)
     (scan,) = (tmp_path / "root").rglob("*.bin")
     for drive in ("0003", "0005"):
         other = Path(str(scan).replace("drive_0000", f"drive_{drive}"))

@@ -6,12 +6,12 @@ import os
 import numpy as np
 import pytest
 
+from dataset_examples import write_example
 from lidargrit.core.discovery import names
 from lidargrit.core.errors import OutputError
 from lidargrit.core.files import remembered
 from lidargrit.data import formats
 from lidargrit.data.datasets import open_dataset
-from lidargrit.data.datasets.argoverse2 import Argoverse2
 from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.formats import ouster_pcap, read_scan
 from lidargrit.data.prepared.config import DataConfig
@@ -28,7 +28,7 @@ def test_every_format_that_tells_of_a_companion_names_its_file(tmp_path):
 
 def test_labels_that_come_later_make_prepared_scans_stale(tmp_path):
     tree = tmp_path / "tree"
-    KittiOdometry.write_example(tree, 1)
+    write_example("kitti_odometry", tree, 1)
     source, out = f"kitti_odometry:{tree}", tmp_path / "out"
     cached = prepare(source, CONFIG)
     prepare(source, CONFIG, out)
@@ -50,7 +50,7 @@ def test_labels_that_come_later_make_prepared_scans_stale(tmp_path):
 @pytest.mark.parametrize("named", ["argoverse2", "folder"])
 def test_a_calibration_belongs_to_the_scans_of_its_log(named, tmp_path):
     pytest.importorskip("pyarrow")
-    Argoverse2.write_example(tmp_path / "tree", 1)
+    write_example("argoverse2", tmp_path / "tree", 1)
     dataset = open_dataset(f"{named}:{tmp_path / 'tree'}")
     (calibration,) = dataset.sidecar_files(0)
     assert calibration.parent.name == "calibration"

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from dataset_examples import write_example
 from lidargrit.core import configuration, reporting
 from lidargrit.core.errors import CheckpointError, ConfigError, OutputError, TrainingError
 from lidargrit.core.files import claim_folder, read_tensors, write_json, write_tensors
 from lidargrit.data.batches import Batches
-from lidargrit.data.datasets.kitti_odometry import KittiOdometry
 from lidargrit.data.prepared.config import DataConfig
 from lidargrit.data.sources import load_range_images
 from lidargrit.generation.objective import Objective
@@ -232,7 +232,7 @@ def test_one_real_scan_is_learned_by_heart(tmp_path, real):
 
 
 def test_a_tree_of_scans_trains_from_its_folder_alone(tmp_path):
-    KittiOdometry.write_example(tmp_path / "tree", 4)
+    write_example("kitti_odometry", tmp_path / "tree", 4)
     settings = [f"data.train={tmp_path / 'tree'}", f"data.val={tmp_path / 'tree'}:all[:50%]"]
     generator = train(load_preset("lidargrit_demo", TINY + settings), Path(tmp_path / "run"))
     first, again = (generator.sample([5, 6]), generator.sample([6]))

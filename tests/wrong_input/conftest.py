@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dataset_examples import write_example
 from lidargrit.cli import main
-from lidargrit.data.datasets import load
 from tiny_runs import contents, the_one_line, train_words
 
 
@@ -37,7 +37,7 @@ def samples(finished, tmp_path) -> Path:
 def rows(tmp_path_factory) -> np.ndarray:
     """Return the rows of a good scan."""
     folder = tmp_path_factory.mktemp("good")
-    load("folder").write_example(folder, 1)
+    write_example("folder", folder, 1)
     return np.fromfile(folder / "000000.bin", dtype="<f4").reshape(-1, 4)
 
 

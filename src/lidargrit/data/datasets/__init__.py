@@ -179,15 +179,6 @@ class ScanDataset(ABC):
     def matches(cls, root: Path) -> bool:
         """Return whether a folder looks like this tree."""
 
-    @classmethod
-    @abstractmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Write simulated scans as a small tree of this layout.
-
-        Raises:
-            OutputError: a file of it exists already.
-        """
-
 
 @dataclass(frozen=True)
 class Window:

@@ -38,10 +38,6 @@ class Argoverse2(FileDataset):
         "sensors/lidar/*.feather",
         "*.feather",
     )
-    examples = (
-        "train/00000000-0000-3000-8000-000000000000/sensors/lidar/{index:018d}.feather",
-        "val/00000000-0000-3000-8000-000000000001/sensors/lidar/{index:018d}.feather",
-    )
 
     def motion(self, index: int) -> Motion:
         """Return time and pose of a scan, by its file's name and ``city_SE3_egovehicle.feather`` of its log."""

@@ -35,7 +35,6 @@ class Folder(FileDataset):
     format = ""
     citation = "that of your files"
     patterns = ("**/*",)
-    examples = ("{index:06d}.bin", "more/{index:06d}.bin")
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         found = _TOPIC.fullmatch(split)

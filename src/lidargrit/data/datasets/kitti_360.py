@@ -67,10 +67,6 @@ class Kitti360(FileDataset):
         ),
     }
     patterns = ("data_3d_raw/2013_05_28_drive_????_sync/velodyne_points/data/*.bin",)
-    examples = (
-        "data_3d_raw/2013_05_28_drive_0000_sync/velodyne_points/data/{index:010d}.bin",
-        "data_3d_raw/2013_05_28_drive_0003_sync/velodyne_points/data/{index:010d}.bin",
-    )
 
     def motion(self, index: int) -> Motion:
         """Return time and pose of a scan: those of the car in ``data_poses``, and of the sensor on it."""

@@ -29,7 +29,6 @@ class KittiObject(FileDataset):
         )
     }
     patterns = ("t*ing/velodyne/*.bin",)
-    examples = ("training/velodyne/{index:06d}.bin", "testing/velodyne/{index:06d}.bin")
 
     def sequence_of(self, relative: Path) -> str:
         """Name the half of the benchmark: "training"."""

@@ -53,7 +53,6 @@ class KittiOdometry(FileDataset):
         )
     }
     patterns = ("sequences/*/velodyne/*.bin", "dataset/sequences/*/velodyne/*.bin")
-    examples = ("sequences/00/velodyne/{index:06d}.bin", "sequences/08/velodyne/{index:06d}.bin")
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         super().__init__(root, split, bad_points)

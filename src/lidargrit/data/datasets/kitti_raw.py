@@ -18,10 +18,6 @@ class KittiRaw(FileDataset):
     format = "kitti_bin"
     citation = "Geiger, Lenz, Stiller, Urtasun: Vision meets robotics: the KITTI dataset, IJRR 2013"
     patterns = ("????_??_??/*_sync/velodyne_points/data/*.bin",)
-    examples = (
-        "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/{index:010d}.bin",
-        "2011_09_28/2011_09_28_drive_0002_sync/velodyne_points/data/{index:010d}.bin",
-    )
 
     def sequence_of(self, relative: Path) -> str:
         """Name the drive: "2011_09_26_drive_0001_sync"."""

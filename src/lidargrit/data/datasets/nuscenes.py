@@ -86,10 +86,6 @@ class Nuscenes(FileDataset):
         )
     }
     patterns = ("s[aw]*/LIDAR_TOP/*.pcd.bin", "LIDAR_TOP/*.pcd.bin", "*.pcd.bin")
-    examples = (
-        "samples/LIDAR_TOP/n001-2018-01-01-00-00-00+0000__LIDAR_TOP__{index:016d}.pcd.bin",
-        "sweeps/LIDAR_TOP/n002-2018-01-01-00-00-00+0000__LIDAR_TOP__{index:016d}.pcd.bin",
-    )
 
     def __init__(self, root: Path, split: str = "all", bad_points: BadPoints = "refuse") -> None:
         self._scenes_of_log = _read_scenes(root)

@@ -20,7 +20,6 @@ class RangeImageFiles(FileDataset):
     format = "range_png"
     citation = "that of your files; Moosmann and Stiller: Velodyne SLAM, IV 2011, for the Karlsruhe recordings"
     patterns = ("*/*.png", "*.png")
-    examples = ("drive_a/{index:06d}.png", "drive_b/{index:06d}.png")
 
     def sequence_of(self, relative: Path) -> str:
         """Name the folder of a file."""

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from lidargrit.core.determinism import natural_order
-from lidargrit.core.errors import DataError, OutputError, ScanError, UsageError, nearest_names
+from lidargrit.core.errors import DataError, ScanError, UsageError, nearest_names
 from lidargrit.core.untrusted import check_word
 from lidargrit.data import formats
 from lidargrit.data.datasets import ScanDataset, recognise
@@ -24,7 +24,6 @@ from lidargrit.data.datasets.shared.splits import Split
 from lidargrit.data.formats import BadPoints, ScanFormat
 from lidargrit.scans.motion import Motion
 from lidargrit.scans.projection.sensor_check import elevations_deg
-from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 
 _POINTS_AT_LEAST = 500  # fewer show no elevations
@@ -62,9 +61,6 @@ class FileDataset(ScanDataset):
     """Name of the files' format; empty where each file tells by its looks."""
     patterns: ClassVar[tuple[str, ...]]
     """Where the files lie, seen from the root; the first pattern that finds any counts."""
-    examples: ClassVar[tuple[str, ...]] = ()
-    """Where :meth:`write_example` puts scan number {index}, by turns; none of files that are read and not written."""
-
     topic: str = ""
     """Topic of recordings whose scans are wanted; empty for that which a format takes."""
 
@@ -176,22 +172,6 @@ class FileDataset(ScanDataset):
         pattern = cls._pattern_in(root)
         named = set((pattern or "").split("/")[:-1]) - {"*", "**"}
         return pattern is not None and (bool(named) or not cls._others_below(root, pattern))
-
-    @classmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Write simulated scans as a small tree of this layout."""
-        # Only here: a reader of files needs no simulator.
-        from lidargrit.simulator import simulate  # noqa: PLC0415
-
-        if not cls.examples:
-            raise OutputError(f"an example of {cls.title}", "a layout that can be written", "take another")
-        for index in range(num_scans):
-            path = root / cls.examples[index % len(cls.examples)].format(index=index)
-            if path.exists():
-                raise OutputError(f"{path}, which exists", "a place to write to", "choose an empty folder")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            writer = formats.load(cls.format) if cls.format else formats.candidates(path)[0]
-            writer.write(path, simulate(seed=index, sensor=load_sensor(cls.sensor)))
 
     @abstractmethod
     def sequence_of(self, relative: Path) -> str:

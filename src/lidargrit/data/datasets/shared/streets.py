@@ -82,7 +82,3 @@ class Streets(ScanDataset):
     def matches(cls, root: Path) -> bool:
         """Return False: simulated scans are only opened by name."""
         return False
-
-    @classmethod
-    def write_example(cls, root: Path, num_scans: int) -> None:
-        """Write nothing: ``root`` is a count, and nothing has to exist for it."""
