@@ -80,10 +80,6 @@ class Folder(FileDataset):
         path = self.path(index)
         return (*super().sidecar_files(index), *([label_file(path)] if _may_have_labels(path) else []))
 
-    def sequence_of(self, relative: Path) -> str:
-        """Name the folder of a file."""
-        return relative.parent.as_posix()
-
     def recording_of(self, path: Path) -> str:
         """Name a recording by its folder."""
         return unnamed_recording(path)

@@ -32,11 +32,6 @@ class Pandaset(FileDataset):
             return Motion()
         return Motion(float(known.times_s[int(number)]), torch.from_numpy(known.poses[int(number)].copy()))
 
-    def sidecar_files(self, index: int) -> tuple[Path, ...]:
-        """Return the poses and times of a scan's drive, and its labels."""
-        path = self.path(index)
-        return self._format(path).sidecar_files(path)
-
     def sequence_of(self, relative: Path) -> str:
         """Name the drive of a file: "001"."""
         return relative.parts[-3] if len(relative.parts) > 2 else "."

@@ -21,10 +21,6 @@ class RangeImageFiles(FileDataset):
     citation = "that of your files; Moosmann and Stiller: Velodyne SLAM, IV 2011, for the Karlsruhe recordings"
     patterns = ("*/*.png", "*.png")
 
-    def sequence_of(self, relative: Path) -> str:
-        """Name the folder of a file."""
-        return relative.parent.as_posix()
-
     def recording_of(self, path: Path) -> str:
         """Name a recording by its folder."""
         return unnamed_recording(path)

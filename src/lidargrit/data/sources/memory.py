@@ -1,6 +1,6 @@
 """Scans in memory, or the first points of each scan of a data set → range images, as a source beside those named."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 
@@ -43,7 +43,8 @@ class MemorySource(Source):
         self.projection_variant, first, rays = config.projection_variant, self._scans[0], sensor or self.sensor
         found = told_doubts(first, rays, projection_that_fits(first, rays), self.text)
         self.doubts = tuple(dict.fromkeys((*self.doubts, *filter(None, found))))
-        return _imaged(self._scans.__getitem__, len(self._scans), rays, config, Provenance())
+        chosen = evenly_spaced(config.max_scans or len(self._scans), len(self._scans))
+        return _imaged((self._scans[index] for index in chosen), rays, config, Provenance())
 
 
 class ImagesInMemory(Source):
@@ -100,13 +101,8 @@ class CutSource(Source):
         scans, self.projection_variant = self.scans(), config.projection_variant
         chosen = evenly_spaced(config.max_scans or len(scans), len(scans))
         names, drives = (tuple(of(index) for index in chosen) for of in (scans.name, scans.recording))
-        return _imaged(
-            lambda index: _first_points(scans.scan(index), self._num_points),
-            len(scans),
-            sensor or config.with_projection(self.sensor),
-            config,
-            Provenance(names, drives),
-        )
+        cut = (_first_points(scans.scan(index), self._num_points) for index in chosen)
+        return _imaged(cut, sensor or config.with_projection(self.sensor), config, Provenance(names, drives))
 
 
 def _told(source: Source, num_points: int) -> str:
@@ -117,15 +113,8 @@ def _first_points(scan: Scan, num_points: int) -> Scan:
     return scan.select(torch.arange(min(num_points, len(scan))))
 
 
-def _imaged(
-    scan: Callable[[int], Scan],
-    count: int,
-    sensor: SensorModel,
-    config: DataConfig,
-    provenance: Provenance,
-) -> RangeImages:
-    chosen = evenly_spaced(config.max_scans or count, count)
-    images = [project_by_what_fits(scan(index), sensor, config.projection_variant)[0] for index in chosen]
+def _imaged(scans: Iterable[Scan], sensor: SensorModel, config: DataConfig, provenance: Provenance) -> RangeImages:
+    images = [project_by_what_fits(scan, sensor, config.projection_variant)[0] for scan in scans]
     return RangeImages(sensor, [_Images(images, provenance)])
 
 

@@ -1,10 +1,10 @@
 """An opened source → its scans one after the other, each with the name of the file that is written for it."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
@@ -24,54 +24,7 @@ from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import RangeImage, Scan
 
 
-class NamedScans(ABC):
-    """Scans of a source, evenly spaced where fewer than all are wanted."""
-
-    @abstractmethod
-    def __len__(self) -> int: ...
-
-    @abstractmethod
-    def name(self, index: int) -> str:
-        """Return the name of the file that is written for a scan, without the ending."""
-
-    @abstractmethod
-    def identity(self, index: int) -> ScanIdentity:
-        """Return what identifies a scan."""
-
-    def number(self, index: int) -> int:
-        """Return the number of a scan in its source, whatever other scans are taken."""
-        return index
-
-    @abstractmethod
-    def scan(self, index: int) -> Scan:
-        """Return the points of a scan; those of a range image lie on the rays of its pixels."""
-
-    def timed(self, index: int) -> Scan:
-        """Return the points of a scan with its time and pose, where files beside it tell them."""
-        return self.scan(index)
-
-    @abstractmethod
-    def timed_scans(self) -> list[TimedScan]:
-        """Return when and where each scan was made, where that is known."""
-
-    @abstractmethod
-    def sensor(self) -> SensorModel | None:
-        """Return the sensor on whose rays the points lie, where it is known."""
-
-    def path(self, index: int) -> Path | None:
-        """Return the file that holds the points of a scan; None where there is none."""
-        return None
-
-    @abstractmethod
-    def tell_notes(self, scan: Scan) -> None:
-        """Report what is noted of the source and of a scan that was read from it, but nothing twice."""
-
-    @abstractmethod
-    def check_output(self, out: Path) -> None:
-        """Refuse a folder whose files would become scans of the source."""
-
-
-class PointScans(NamedScans):
+class PointScans:
     """Scans of a data set, by their own names.
 
     Args:
@@ -86,7 +39,7 @@ class PointScans(NamedScans):
         return len(self._indices)
 
     def name(self, index: int) -> str:
-        """Return its name in the data set."""
+        """Return the name of the file that is written for a scan, without the ending: its own in the data set."""
         return self._dataset.name(self._indices[index])
 
     def identity(self, index: int) -> ScanIdentity:
@@ -96,7 +49,7 @@ class PointScans(NamedScans):
         return ScanIdentity(self.name(index), _state(files))
 
     def number(self, index: int) -> int:
-        """Return its number in the data set."""
+        """Return its number in the data set, whatever other scans are taken."""
         return self._indices[index]
 
     def scan(self, index: int) -> Scan:
@@ -104,7 +57,7 @@ class PointScans(NamedScans):
         return self._dataset.scan(self._indices[index])
 
     def timed(self, index: int) -> Scan:
-        """Read its points, time and pose."""
+        """Read its points, with its time and pose where files beside it tell them."""
         (scan,) = Window(self._dataset, (self._indices[index],)).scans()
         return scan
 
@@ -127,7 +80,7 @@ class PointScans(NamedScans):
         return None
 
     def path(self, index: int) -> Path | None:
-        """Return its file."""
+        """Return the file that holds its points; None where there is none."""
         return self._dataset.path(self._indices[index])
 
     def check_output(self, out: Path) -> None:
@@ -137,7 +90,7 @@ class PointScans(NamedScans):
             raise OutputError(got, "a folder outside the source", "choose another folder")
 
 
-class ImageScans(NamedScans):
+class ImageScans:
     """Range images as scans.
 
     Args:
@@ -176,6 +129,13 @@ class ImageScans(NamedScans):
         """Return a point for each return."""
         return unproject(self.image(index))
 
+    def timed(self, index: int) -> Scan:
+        """Return a point for each return; an image tells no time of its own."""
+        return self.scan(index)
+
+    def path(self, index: int) -> None:
+        """Return nothing: its points are in no file."""
+
     def sensor(self) -> SensorModel:
         """Return the sensor of the images."""
         return self.images.sensor
@@ -187,11 +147,15 @@ class ImageScans(NamedScans):
         """Accept every folder: images are looked for in one folder alone, by names that are not written there."""
 
 
+NamedScans: TypeAlias = PointScans | ImageScans
+"""Scans of any source by their numbers from 0 on, with the name of the file that is written for each."""
+
+
 def _state(files: Iterable[Path]) -> str:
     return ", ".join("{} bytes of {} ns".format(*state) for state in map(state_of, files) if state)
 
 
-def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None = None) -> PointScans | ImageScans:
+def named_scans(source: Source, config: DataConfig, sensor: SensorModel | None = None) -> NamedScans:
     """Return the scans of a source: named as in their data set or as their image's file, else by their index.
 
     Args:

@@ -3,7 +3,6 @@
 import errno
 import hashlib
 import os
-from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
@@ -173,9 +172,9 @@ class FileDataset(ScanDataset):
         named = set((pattern or "").split("/")[:-1]) - {"*", "**"}
         return pattern is not None and (bool(named) or not cls._others_below(root, pattern))
 
-    @abstractmethod
     def sequence_of(self, relative: Path) -> str:
-        """Name the sequence (drive, folder) of a file from its path below the root; "." for none."""
+        """Name the sequence (drive) of a file from its path below the root, by default its folder; "." for none."""
+        return relative.parent.as_posix()
 
     def recording_of(self, path: Path) -> str:
         """Name the recording of a file: its data set and sequence, or its folder where sequences have no names."""

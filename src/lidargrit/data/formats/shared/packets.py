@@ -45,9 +45,7 @@ def check_packets(path: Path, wanted: str, cure: str) -> None:
     """
     with open_file(path, wanted) as file:
         try:
-            start = file.read(24)
-            packets = _packets_of_blocks(file) if start[:4] == PCAPNG else _packets_of_records(file, start)
-            for number, (head, size) in enumerate(packets, 1):
+            for number, (head, size) in enumerate(_packets(file), 1):
                 if _is_empty_udp(head, size):
                     raise ScanError(f"{path}, whose packet {number} is of UDP without content", wanted, _EMPTY)
         except _DamagedError as error:
@@ -65,9 +63,7 @@ def other_maker(path: Path) -> str:
     seen = set[int]()
     try:
         with path.open("rb") as file:
-            start = file.read(24)
-            packets = _packets_of_blocks(file) if start[:4] == PCAPNG else _packets_of_records(file, start)
-            for head, _ in islice(packets, _PACKETS_TO_LOOK_AT):
+            for head, _ in islice(_packets(file), _PACKETS_TO_LOOK_AT):
                 seen |= _udp_ports(head)
     except (OSError, _DamagedError):
         pass  # told when the recording is read
@@ -86,8 +82,14 @@ def _udp_ports(head: bytes) -> set[int]:
     return ports
 
 
+def _packets(file: BufferedReader) -> Iterator[tuple[bytes, int]]:
+    """Return the first bytes of each packet, and how many libpcap takes of it."""
+    start = file.read(24)
+    return _packets_of_blocks(file) if start[:4] == PCAPNG else _packets_of_records(file, start)
+
+
 def _packets_of_records(file: BufferedReader, start: bytes) -> Iterator[tuple[bytes, int]]:
-    """Yield the first bytes of each packet of a .pcap, and how many libpcap takes of it."""
+    """Yield the packets of a .pcap; see :func:`_packets`."""
     if len(start) < 24:
         raise _DamagedError("its header is cut short")
     order = "<" if start[0] in _LITTLE else ">"
@@ -106,7 +108,7 @@ def _packets_of_records(file: BufferedReader, start: bytes) -> Iterator[tuple[by
 
 
 def _packets_of_blocks(file: BufferedReader) -> Iterator[tuple[bytes, int]]:
-    """Yield the first bytes of each packet of a .pcapng, and how many libpcap takes of it."""
+    """Yield the packets of a .pcapng; see :func:`_packets`."""
     order, longest, offset = "<", _BYTES_AT_MOST, 0
     while len(block := _read(file, offset, 28 + _LOOK)) >= 28:  # the shortest packet, and an end that is cut short
         if block[:4] == PCAPNG:  # each section has its own byte order

@@ -76,7 +76,7 @@ class SampleFormat:
     suffix: str = ".pth"
     read: Callable[[Path], Tensor] = read_tensor
 
-    def by_size(self) -> dict[tuple[int, int], SensorModel]:
+    def by_size(self) -> dict[tuple[int, ...], SensorModel]:
         """Return the possible sensors by the rows and columns of their images."""
         sensors = [(load_sensor(name), columns, stride) for name, columns, stride in self.sensors]
         chosen = [sensor.with_columns(columns, stride) if columns else sensor for sensor, columns, stride in sensors]
