@@ -127,7 +127,7 @@ def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
         values = np.asarray(points[name])
         if known_name(name) and values.ndim == 1:
             columns[name] = values
-    if ours and {"intensity", "reflectance"} <= columns.keys():
+    if ours and "reflectance" in columns:
         off = np.abs(intensity - _steps(columns["reflectance"]).astype(np.int64))
         if off.max() > 1:  # by which points that were added to a file may be rounded
             del columns["reflectance"]  # of before another program changed the intensity
