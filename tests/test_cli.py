@@ -371,7 +371,9 @@ def test_a_reader_that_has_seen_enough_is_no_error(words):
     with contextlib.closing(os.fdopen(writing, "w")) as pipe:
         command = [sys.executable, "-m", "lidargrit", *words]
         done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+    slow = [f"lidargrit {words[0]} loads its libraries"] if words else []  # told after two seconds
+    assert done.returncode == 0
+    assert done.stderr.splitlines() in ([], slow)
 
 
 def test_every_option_says_what_it_is():
