@@ -241,7 +241,9 @@ def test_one_camera_turns_all_views(opened):
     opened.move(5, 5)
     assert all((opened.screenshot(".cloud", which) == before[which]).all() for which in range(2))
     opened.press("d")
-    opened.press("w")
+    tilt = opened.run("page.camera.tilt")
+    opened.press("W")
+    assert opened.run("page.camera.tilt") > tilt, "though Caps Lock is on"
     opened.press("+")
     assert all((opened.screenshot(".cloud", which) != before[which]).any() for which in range(2))
 

@@ -101,8 +101,8 @@ class Page {
 
   press(event) {
     const keys = {
-      ArrowLeft: () => this.step(-1),
-      ArrowRight: () => this.step(1),
+      arrowleft: () => this.step(-1),
+      arrowright: () => this.step(1),
       p: () => this.play(!this.playing && !this.control.play.hidden),
       a: () => this.camera.orbit(-0.08, 0),
       d: () => this.camera.orbit(0.08, 0),
@@ -116,9 +116,10 @@ class Page {
     // Sliders, lists and fields have these keys for themselves, and the browser has those with Ctrl.
     const own = event.target.matches?.("input:not([type=checkbox]), select, textarea");
     const taken = own || event.ctrlKey || event.metaKey || event.altKey;
-    if (!taken && event.key in keys) {
+    const key = event.key.toLowerCase(); // Caps Lock may be on
+    if (!taken && key in keys) {
       event.preventDefault();
-      keys[event.key]();
+      keys[key]();
       this.redraw();
     }
   }
