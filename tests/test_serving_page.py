@@ -200,6 +200,16 @@ def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opene
     assert opened.run("desk.request().sampling") == {"steps": 256}
 
 
+def test_a_setting_that_cannot_be_is_shown_though_it_is_folded_away(opened):
+    fill(opened, "#settings [name=top_k]", "5000")
+    for button in ("#generate", "[data-example=street]"):
+        opened.run("document.querySelector('#more').open = false")
+        opened.click(button)
+        assert opened.run("document.activeElement.name") == "top_k", button
+        assert names(opened) == []
+    assert opened.troubles() == []
+
+
 def test_the_mouse_draws_the_region_that_is_filled_in(opened, scan_file):
     choose_file(opened, scan_file)
     opened.click("#tasks [value=region]")

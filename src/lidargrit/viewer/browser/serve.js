@@ -86,9 +86,10 @@ class Desk {
     el("count").max = String(limits.scans);
     el("model").addEventListener("change", () => this.offer());
     el("request").addEventListener("submit", (event) => this.submit(event, () => this.generate()));
+    el("settings").addEventListener("invalid", () => (el("more").open = true), { capture: true }); // what is wrong is to be seen
     el("own").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.workOn(event.submitter?.value ?? "ahead");
+      this.workOn(event.submitter.value);
     });
     el("file").addEventListener("change", () => this.chooseExample(""));
     for (const button of el("examples").children) {
@@ -216,6 +217,9 @@ class Desk {
 
   async submit(event, begin) {
     event?.preventDefault();
+    if (!el("request").reportValidity()) {
+      return; // a scan is worked on by these settings too
+    }
     this.busy = true;
     this.enable();
     const changed = Object.entries(this.request().sampling).map(([name, value]) => `${name}=${value}`);
