@@ -260,6 +260,7 @@ def test_view_draws_runs_samples_and_scans(run_folder, samples, tmp_path, typed)
     typed("view", samples, run_folder, "-o", tmp_path / "run.html", "-n", 9)
     page = (tmp_path / "run.html").read_text(encoding="utf-8")
     assert page.count(": reconstructed") >= 1
+    assert page.count('"generated": true') == 3, "samples, their reconstructions and new ones: none was measured"
     assert page.count('"seed ') == 9
     with Image.open(tmp_path / "run.png") as picture:
         assert picture.height < four_rows

@@ -112,6 +112,8 @@ def test_models_that_do_not_complete_have_no_task(scan_file):
         compute_result(model, SampleRequest(0, task=task, file=str(scan_file))) for task in ("returns", "vlp16")
     )
     assert np.array_equal(plain[0].images.range_m, chosen[0].images.range_m), "the task of another model"
+    assert [one.generated for one in plain] == [False, True], "no pixel of a reconstruction was measured"
+    assert plain[0].filled is None, "nothing to tell apart in a scan"
 
 
 def test_messages_of_tasks_name_no_option_of_the_command_line(tmp_path):

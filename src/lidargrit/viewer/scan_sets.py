@@ -122,7 +122,7 @@ def _of_generator(name: str, generator: Generator, seeds: range, scans: ScanSet 
         images = scans.images
         if generator.sensor.same_rays(images.sensor):
             reconstructed = generator.reconstruct(images).to("cpu")
-            yield ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names)
+            yield ScanSet(f"{_short(name)}: reconstructed", reconstructed, scans.scan_names, generated=True)
         else:
             reporting.message(f"{name}: no reconstructions, for its sensor has other rays than {scans.name}")
     generated = generator.sample(seeds).to("cpu")
@@ -140,7 +140,8 @@ def _of_images(source: Source, count: int, sensor: SensorModel | None, config: D
     indices = evenly_spaced(count, len(images))
     names = tuple(images.provenance.names[index].rpartition("/")[2] for index in indices)
     timed = images.timed_scans()
-    return ScanSet(source.text, images.batch(indices), names, times_s=_times_s(timed[index] for index in indices))
+    times_s = _times_s(timed[index] for index in indices)
+    return ScanSet(source.text, images.batch(indices), names, generated=source.is_generated, times_s=times_s)
 
 
 def _times_s(scans: Iterable[TimedScan]) -> tuple[float, ...]:

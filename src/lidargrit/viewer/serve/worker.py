@@ -164,10 +164,12 @@ def compute_result(
     image = RangeImage.stack([seen.image])
     if request.task == "label" and segmenter is not None:
         return [ScanSet("labelled", label_images(segmenter, image), (request.name,))]
-    measured = torch.zeros_like(image.return_mask)  # nothing in it was filled
-    sets = [ScanSet("example" if request.example else "as uploaded", image, (request.name,), filled=measured)]
+    given = ScanSet("example" if request.example else "as uploaded", image, (request.name,))
     if "complete" not in generator.capabilities:
-        return [*sets, ScanSet("reconstructed", generator.reconstruct(image).to("cpu"), (request.name,))]
+        new = generator.reconstruct(image).to("cpu")
+        return [given, ScanSet("reconstructed", new, (request.name,), generated=True)]
+    measured = torch.zeros_like(image.return_mask)  # nothing in it was filled
+    sets = [dataclasses.replace(given, filled=measured)]
     if request.task == "region" and not request.region:
         return sets  # on which the region is drawn
     names = tuple(f"{request.name}, seed {seed}" for seed in seeds)
