@@ -36,3 +36,11 @@ def test_a_mark_on_a_point_that_the_next_scan_does_not_have_goes_away(browser, t
     assert browser.troubles() == []
     assert browser.run("document.querySelector('#panes').getAttribute('aria-busy')") == "false"
     assert browser.run("document.querySelector('[data-part=readout]').textContent") == ""
+
+
+def test_a_long_name_does_not_make_the_page_wider_than_its_window(browser, tmp_path):
+    sensor = load_sensor("hdl64e_kitti_odometry").with_columns(64)
+    images = RangeImage(torch.full((1, 64, 64), 9.0), torch.ones(1, 64, 64, dtype=torch.bool), sensor)
+    write_page([ScanSet("one", images, ("n" * 250,)), ScanSet("other", images, ("b",))], tmp_path / "page.html")
+    browser.open(tmp_path / "page.html")
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
