@@ -116,7 +116,7 @@ class Page {
     // Sliders, lists and fields have these keys for themselves, and the browser has those with Ctrl.
     const own = event.target.matches?.("input:not([type=checkbox]), select, textarea");
     const taken = own || event.ctrlKey || event.metaKey || event.altKey;
-    const key = event.key.toLowerCase(); // Caps Lock may be on
+    const key = event.key?.toLowerCase(); // Caps Lock may be on, and a field that fills itself in presses none
     if (!taken && key in keys) {
       event.preventDefault();
       keys[key]();
