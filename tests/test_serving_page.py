@@ -192,6 +192,15 @@ def test_scans_without_labels_are_not_coloured_by_those_that_were_shown_before(o
     assert opened.run("[...document.querySelectorAll('[data-part=missing]')].every((one) => !one.textContent)")
 
 
+def test_new_scans_are_not_coloured_by_what_scans_had_that_were_removed(opened):
+    for mode in ("filled", "height", "filled"):
+        opened.click("#generate" if mode == "height" else "[data-example=street]")
+        finish(opened)
+        assert opened.run("document.querySelector('#mode').value") == mode
+        while names(opened):
+            opened.click("[data-part=remove]")
+
+
 def test_a_number_that_is_typed_is_sent_though_it_is_the_one_that_is_shown(opened):
     fill(opened, "#model", "2")
     assert opened.run("document.querySelector('[name=steps]').placeholder") == "256"

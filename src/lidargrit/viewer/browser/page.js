@@ -52,13 +52,17 @@ class Page {
   // Only what some scan has.
   offerModes() {
     const has = (name) => this.panes.some((pane) => pane.source.data.scans.some((scan) => scan[name]));
+    const { mode } = this.control;
     for (const name of ["reflectance", "anomaly", "label", "filled"]) {
-      this.control.mode.querySelector(`[value=${name}]`).disabled = !has(name);
+      mode.querySelector(`[value=${name}]`).disabled = !has(name);
     }
-    this.offered ??= ["anomaly", "filled"].find(has);
-    if (this.offered && !this.chosen) {
-      this.chosen = true;
-      this.control.mode.value = this.offered;
+    if (mode.selectedOptions[0].disabled) {
+      mode.value = "height"; // by what only scans had that are gone, all would be of one colour
+      this.chosen = false;
+    }
+    const offered = ["anomaly", "filled"].find(has);
+    if (offered && !this.chosen) {
+      this.colourBy(offered);
     }
     this.control.position.max = String(this.count);
     for (const name of ["previous", "next", "position"]) {
