@@ -129,7 +129,7 @@ def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
             columns[name] = values
     if ours and "reflectance" in columns:
         off = np.abs(intensity - _steps(columns["reflectance"]).astype(np.int64))
-        if off.max() > 1:  # by which points that were added to a file may be rounded
+        if np.any(off > 1):  # by which points that were added to a file may be rounded
             del columns["reflectance"]  # of before another program changed the intensity
     return columns
 
