@@ -192,7 +192,7 @@ def bombs() -> dict[str, bytes]:
 
 
 def test_hostile_files_are_refused_and_removed(served, tmp_path):
-    status = Path(f"/proc/{served.queue._worker.pid}/status")
+    status = Path(f"/proc/{served.queue._worker._process.pid}/status")
     jobs = {}
     for name, data in bombs().items():
         (tmp_path / name).write_bytes(data)
@@ -315,7 +315,7 @@ def test_fifty_clients_at_once(served):
     assert sorted(answers) == [202] * LIMITS.waiting + [503] * (50 - LIMITS.waiting)
     waiting = served.queue._waiting[0]
     served.queue.limits = replace(LIMITS, unpolled_seconds=0.0)  # nobody asks for theirs
-    os.kill(served.queue._worker.pid, signal.SIGKILL)  # as when memory runs out
+    os.kill(served.queue._worker._process.pid, signal.SIGKILL)  # as when memory runs out
     assert "during which the program ended" in served.ended(holding)["error"]
     end = time.monotonic() + 20
     while served.queue._waiting:

@@ -4,11 +4,9 @@ const FIELD_OF_VIEW = Math.PI / 3.6; // 50 degrees: what a person takes in witho
 const NEAREST_M = 0.2;
 const FARTHEST_M = 2000;
 
-const TYPICAL_REACH_M = 24; // within which most returns of a street lie
-
 class Camera {
   // Most points of the scans to be looked at lie within reachM of the sensor.
-  constructor(reachM = TYPICAL_REACH_M) {
+  constructor(reachM) {
     this.reachM = Math.min(120, Math.max(4, reachM));
     this.reset();
   }

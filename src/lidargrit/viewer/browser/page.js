@@ -51,7 +51,7 @@ class Page {
 
   // Only what some scan has.
   offerModes() {
-    const has = (name) => this.panes.some((pane) => pane.source.data.scans.some((scan) => scan[name]));
+    const has = (name) => this.panes.some((pane) => pane.source.scans.some((scan) => scan[name]));
     const { mode } = this.control;
     for (const name of ["reflectance", "anomaly", "label", "filled"]) {
       mode.querySelector(`[value=${name}]`).disabled = !has(name);
@@ -73,7 +73,7 @@ class Page {
 
   // When each scan of a drive was made; nothing where none of the panes shows one.
   times() {
-    const all = this.panes.map((pane) => pane.source.data.scans.map((scan) => scan.time));
+    const all = this.panes.map((pane) => pane.source.scans.map((scan) => scan.time));
     return all.find((times) => times.length === this.count && this.count > 1 && !times.includes(undefined));
   }
 
@@ -97,7 +97,10 @@ class Page {
       this.sizeChosen = true;
       this.redraw();
     });
-    reset.addEventListener("click", () => this.lookAgain());
+    reset.addEventListener("click", () => {
+      this.camera.reset();
+      this.redraw();
+    });
     light.addEventListener("change", () => this.paint());
     window.addEventListener("keydown", (event) => this.press(event));
     new ResizeObserver(() => this.redraw()).observe(this.area);
@@ -139,11 +142,6 @@ class Page {
       }
     };
     requestAnimationFrame(next);
-  }
-
-  lookAgain() {
-    this.camera.reset();
-    this.redraw();
   }
 
   // Round and round: after the last comes the first.

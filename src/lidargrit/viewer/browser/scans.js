@@ -3,21 +3,14 @@
 // One set of scans that share their rays.
 class Source {
   constructor(data) {
-    this.name = data.name;
-    this.height = data.height;
-    this.width = data.width;
+    Object.assign(this, data); // see _source of interactive.py
     this.size = data.height * data.width;
-    this.rangeStepM = data.rangeStepM;
-    this.endM = data.endM;
-    this.classes = data.classes;
-    this.generated = data.generated; // by a model, every point
     this.columns = data.columnStride > 1 ? `, one in ${data.columnStride} columns` : "";
-    this.data = data;
     this.unpacked = new Map();
   }
 
   get count() {
-    return this.data.scans.length;
+    return this.scans.length;
   }
 
   // A set with fewer scans than the longest stays at its last one.
@@ -31,7 +24,7 @@ class Source {
       this.rays = await unpackRays(this);
     }
     if (!this.unpacked.has(own)) {
-      this.unpacked.set(own, await unpackScan(this, this.data.scans[own]));
+      this.unpacked.set(own, await unpackScan(this, this.scans[own]));
     }
     return this.unpacked.get(own);
   }
@@ -67,8 +60,8 @@ async function unpack(text) {
 
 // The unit vector of every pixel's ray: x forward, y left, z up.
 async function unpackRays(source) {
-  const elevation = new Float32Array(await unpack(source.data.elevation));
-  const azimuth = new Float32Array(await unpack(source.data.azimuth));
+  const elevation = new Float32Array(await unpack(source.elevation));
+  const azimuth = new Float32Array(await unpack(source.azimuth));
   const rays = new Float32Array(3 * source.size);
   for (let pixel = 0; pixel < source.size; pixel++) {
     const row = Math.floor(pixel / source.width);

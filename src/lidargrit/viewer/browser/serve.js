@@ -14,7 +14,7 @@ class ServedPane extends Pane {
     }
     this.part.npz.addEventListener("click", () => this.save("npz"));
     this.part.remove.setAttribute("aria-label", `Remove ${source.name}`);
-    this.part.remove.addEventListener("click", () => desk.remove(this));
+    this.part.remove.addEventListener("click", () => desk.arrange(page.panes.filter((one) => one !== this)));
     this.path = `/jobs/${job}/${group}`;
     this.frame = Object.assign(document.createElement("div"), { className: "region", hidden: true });
     this.part.image.after(this.frame);
@@ -286,10 +286,6 @@ class Desk {
     }
     await this.arrange([...this.page.panes, ...fresh].slice(-Math.max(PANES_AT_MOST, fresh.length)));
     fresh.at(-1).element.scrollIntoView({ block: "nearest" }); // on a small screen the form lies below
-  }
-
-  async remove(pane) {
-    await this.arrange(this.page.panes.filter((one) => one !== pane));
   }
 
   // One scale of each colour for all panes, wide enough for every scan.

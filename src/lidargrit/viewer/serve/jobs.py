@@ -200,11 +200,6 @@ class WorkerProcess:
         self._lines: queue.Queue[str] = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
 
-    @property
-    def pid(self) -> int:
-        """Return the number of the process."""
-        return self._process.pid
-
     def is_alive(self) -> bool:
         """Return whether the process still runs."""
         return self._process.poll() is None
