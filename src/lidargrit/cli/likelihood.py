@@ -32,8 +32,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.evaluation.likelihood import measure_source
 
     refuse_taken(options)
-    if options.map is not None:
-        refuse_to_overwrite(options.map, options.overwrite, ".npy")
+    refuse_to_overwrite(options.map, options.overwrite, ".npy")
     named = (options.scans, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)
     sensor = sensor_for_run(settings, options.scans, options.model)

@@ -175,7 +175,6 @@ _JSON_NAMES: dict[type, str] = {
     int: "a number",
     float: "a number",
     type(None): "null",
-    object: "anything",
 }
 
 
