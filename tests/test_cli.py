@@ -212,6 +212,7 @@ def test_sampling_options_reach_the_model(run_folder, tmp_path, typed):
         "mask": "threshold",
         "range_temperature": 0.0,
         "surface_temperature": 0.0,
+        "mask_temperature": 0.0,
         "batch_size": 0,
         "range_noise": 0.7,
         "mask_correlation": 2.0,

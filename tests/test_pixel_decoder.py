@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from lidargrit.core.errors import ConfigError
+from lidargrit.generation.pixel_decoder.mask_network import tempered
 from lidargrit.generation.pixel_decoder.phase_network import Guide, PixelDecoderConfig
 from lidargrit.generation.pixel_decoder.pixel_decoder import PixelDecoder, PixelSampling, nats_to_range_bits
 from lidargrit.generation.pixel_decoder.pixel_phases import (
@@ -220,7 +221,7 @@ def test_16_bits_move_few_pixels_and_leave_32_bits_as_they_were() -> None:
     assert torch.equal(sample("fp32").range_m, exact.range_m)
 
 
-@pytest.mark.parametrize("name", ["range_temperature", "surface_temperature"])
+@pytest.mark.parametrize("name", ["range_temperature", "surface_temperature", "mask_temperature"])
 @torch.no_grad()
 def test_a_model_has_temperatures_of_its_own(name: str) -> None:
     sensor = tiny_sensor(16, 32)
@@ -236,6 +237,20 @@ def test_a_model_has_temperatures_of_its_own(name: str) -> None:
     for senseless in (0.0, -1.0, math.inf, math.nan):
         with pytest.raises(ConfigError, match=f"{name}={senseless}"):
             replace(PixelDecoderConfig(), **{name: senseless})
+
+
+@pytest.mark.parametrize("temperature", [0.05, 0.3, 1.0, 4.0])
+def test_a_temperature_of_masks_leaves_rare_drops_and_returns_alone(temperature: float) -> None:
+    """Between a tenth and nine tenths the odds, counted from these ends, are taken to a power."""
+    given = torch.linspace(0, 1, 201, dtype=torch.float64)
+    found = tempered(given, temperature)
+    for before, after in zip(given.tolist(), found.tolist(), strict=True):
+        if 0.1 < before < 0.9:
+            low, high = ((before - 0.1) / 0.8) ** (1 / temperature), ((0.9 - before) / 0.8) ** (1 / temperature)
+            assert after == pytest.approx(0.1 + 0.8 * low / (low + high), abs=1e-9)
+        else:
+            assert after == before
+    assert torch.all(found.diff() >= 0)
 
 
 @torch.no_grad()

@@ -37,8 +37,9 @@ def scan_file(tmp_path_factory) -> Path:
 def test_numbers_of_every_generator_can_be_chosen():
     found = {name: [setting.name for setting in sampling_settings(made(name)[0].Sampling())] for name in MODELS}
     of_tokens = ["temperature", "top_k", "top_p", "guidance"]
+    of_pixels = [*(f"{what}_temperature" for what in ("range", "surface", "mask")), "range_noise", "mask_correlation"]
     assert found == {
-        "lidargrit": [*of_tokens, "range_temperature", "surface_temperature", "range_noise", "mask_correlation"],
+        "lidargrit": [*of_tokens, *of_pixels],
         "marginal": [],
         "r2dm": ["steps", "resamples"],
     }

@@ -10,9 +10,9 @@ from torch.utils.data import DataLoader
 import lidargrit
 from lidargrit.cli import main
 from lidargrit.data.sources import open_images
+from lidargrit.systems.lidargrit.system import LidarGrit
 
 SENSOR = lidargrit.load_sensor("hdl64e_kitti_odometry").with_columns(64)
-ALONE = ["--set", "sampling.batch_size=1"]  # else eight scans are computed for two
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,8 @@ def sources(tmp_path_factory):
         patch.setenv("LIDARGRIT_CACHE", str(folder / "cache"))
         words = ["--set", "data.columns=64", "--workers", "1"]
         assert main(["prepare", "simulated:6:train", "-o", str(folder / "prepared"), *words]) == 0
-        assert main(["sample", "pretrained", str(folder / "samples"), "-n", "2", *ALONE]) == 0
+        LidarGrit(LidarGrit.smallest_config(SENSOR), SENSOR).save(folder / "run")
+        assert main(["sample", str(folder / "run"), str(folder / "samples"), "-n", "2"]) == 0
         yield {"streets": "simulated:6:train", "prepared": folder / "prepared", "samples": folder / "samples"}
 
 

@@ -54,6 +54,8 @@ class DecodingOfTokens(SamplingSettings):
             the model gives.
         surface_temperature: temperature of the pixel decoder's choice between surfaces that lie apart; below 1 edges of
             objects are less ragged; 0 takes the model's own (``model.pixels.surface_temperature``).
+        mask_temperature: temperature of the pixel decoder's returns that are neither rare nor nearly certain; below 1
+            windows are closed; 0 takes the model's own (``model.pixels.mask_temperature``).
         range_noise: multiplier of the pixel decoder's spread of ranges about a surface.
         mask_correlation: multiplier of how much of their noise close pixels of the pixel decoder's mask share that are
             sampled at once; 0 samples them independently.
@@ -65,6 +67,7 @@ class DecodingOfTokens(SamplingSettings):
     mask: PixelChoice = "auto"
     range_temperature: float = PixelSampling.range_temperature
     surface_temperature: float = PixelSampling.surface_temperature
+    mask_temperature: float = PixelSampling.mask_temperature
     range_noise: float = PixelSampling.range_noise
     mask_correlation: float = PixelSampling.mask_correlation
     decoder: Precision = "fp32"
@@ -78,6 +81,7 @@ class DecodingOfTokens(SamplingSettings):
         return PixelSampling(
             range_temperature=self.range_temperature,
             surface_temperature=self.surface_temperature,
+            mask_temperature=self.mask_temperature,
             range_noise=self.range_noise,
             mask_correlation=self.mask_correlation,
             precision=self.decoder,

@@ -26,7 +26,7 @@ from lidargrit.training.checkpoint import load_average
 
 _UNKNOWN_SCANS = "a run that does not say on which scans it was trained"  # in the place of a source
 _NOT_LEARNED = (  # of sampling, of training, and of another stage
-    *("range_temperature", "surface_temperature", "own_context"),
+    *("range_temperature", "surface_temperature", "mask_temperature", "own_context"),
     *("distilled_steps", "distilled_pairs"),
 )
 

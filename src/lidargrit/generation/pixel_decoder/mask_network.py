@@ -18,6 +18,8 @@ from lidargrit.scans.sensors import SensorModel
 
 _NEVER = -60.0  # logit of a return in rows that a sensor does not have
 
+_BY_CHANCE = 0.1  # returns and drops that are rarer come by chance; others belong to a surface
+
 
 class MaskNetwork(PhaseNetwork):
     """The logits of P(return), given which of the earlier pixels returned: a correction of the decoder's logits."""
@@ -87,18 +89,21 @@ class MaskNetwork(PhaseNetwork):
             numbers = [following(own, [drawn[seed] for seed in some]) for own, some in zip(numbers, every, strict=True)]
         return torch.stack(numbers).to(self.before.device)
 
-    def sample(self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed) -> Bool[Tensor, "B H W"]:
+    def sample(
+        self, guide: Guide, uniform: Float[Tensor, "B H W"], condition: Observed, temperature: float = 1.0
+    ) -> Bool[Tensor, "B H W"]:
         """Return the mask, sampled phase by phase around its observed pixels.
 
         Args:
             guide: output of the decoder for every pixel.
             uniform: random numbers in [0, 1): independent ones, or those that ``noise`` makes of them.
+            temperature: temperature of returns that are neither rare nor nearly certain; 1 leaves them unchanged.
         """
         guided = self.guided(guide)
         mask = condition.return_mask & condition.return_observed
         for phase in self.phases:
             pixels = (..., *phase.pixels)
-            sampled = uniform[pixels] < self.logits([phase], guided, guide, mask)[0].sigmoid()
+            sampled = uniform[pixels] < tempered(self.logits([phase], guided, guide, mask)[0].sigmoid(), temperature)
             mask[pixels] = torch.where(condition.return_observed[pixels], mask[pixels], sampled)
         return mask
 
@@ -149,3 +154,16 @@ class MaskNetwork(PhaseNetwork):
             nll = self.phase_nll(chosen, guided, guide, returned)
             total = total + nll.sum((0, 2, 3)) * (len(phases) / len(chosen))
         return total
+
+
+def tempered(probability: Float[Tensor, "*P"], temperature: float) -> Float[Tensor, "*P"]:
+    """Return probabilities of a return, sharper between a tenth and nine tenths where the temperature is below 1.
+
+    Rarer drops and returns keep their probability: a temperature of all would take the drops that come by chance away.
+    """
+    if temperature == 1:
+        return probability
+    width = 1 - 2 * _BY_CHANCE
+    share = (probability - _BY_CHANCE) / width
+    sharper = _BY_CHANCE + width * (share.clamp(0, 1).logit() / temperature).sigmoid()
+    return torch.where((share > 0) & (share < 1), sharper, probability)

@@ -65,6 +65,8 @@ class PixelDecoderConfig(Settings):
             on its columns and its training: choose it by samples against validation scans.
         surface_temperature: temperature of the choice between surfaces where the caller names none. Below 1 edges of
             objects are less ragged; where the tokenizer tells little of thin objects, more of these are lost.
+        mask_temperature: temperature of returns that are neither rare nor nearly certain, where the caller names none.
+            Below 1 windows are closed, and drops cluster more.
     """
 
     coarsest_cell: Count = 8
@@ -85,6 +87,7 @@ class PixelDecoderConfig(Settings):
     any_sensor: bool = False
     range_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 0.35
     surface_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 1.0
+    mask_temperature: Annotated[float, Bounds(TEMPERATURE_AT_LEAST)] = 1.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

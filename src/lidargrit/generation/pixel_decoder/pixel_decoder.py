@@ -44,8 +44,8 @@ class PixelSampling(SamplingSettings):
     """Settings of sampling masks, and ranges from their mixtures.
 
     By default samples are sharper than the mixtures themselves, which are ragged where a surface is uncertain. Only
-    pixels that are sampled with 1, 1, 1 and a correlation of 0 follow the distribution, given the tokens, whose
-    likelihood the model computes.
+    pixels that are sampled with temperatures and noise of 1 and a correlation of 0 follow the distribution, given the
+    tokens, whose likelihood the model computes.
 
     Args:
         range_temperature: temperature of the mixture's density on one surface; 1 leaves it unchanged, below 1 prefers
@@ -53,6 +53,9 @@ class PixelSampling(SamplingSettings):
             own temperature (``model.pixels.range_temperature``).
         surface_temperature: temperature of the choice between surfaces that lie apart; 1 leaves it unchanged, below 1
             prefers the more probable one. 0 takes the model's own (``model.pixels.surface_temperature``).
+        mask_temperature: temperature of returns that are neither rare nor nearly certain; 1 leaves them unchanged,
+            below 1 prefers the more probable, so that windows are closed. Drops by chance keep their probability. 0
+            takes the model's own (``model.pixels.mask_temperature``).
         range_noise: multiplier of the components' scales; 1 takes them as they are.
         mask_correlation: multiplier of how much of their noise close pixels of a mask share that are sampled at once,
             so that drops cluster; 1 takes what was learned in training, 0 samples them independently.
@@ -64,6 +67,7 @@ class PixelSampling(SamplingSettings):
 
     range_temperature: Temperature = 0.0
     surface_temperature: Temperature = 0.0
+    mask_temperature: Temperature = 0.0
     range_noise: Annotated[float, Bounds(above=0, most=_NOISE_AT_MOST)] = 0.7
     mask_correlation: Weight = 2.0
     precision: Precision = "fp32"
@@ -264,6 +268,7 @@ class PixelDecoder(RayNetwork):
         """
         guide, size = self.guide(decoded, len(rngs)), (3, self.grid.height, self.grid.width)
         choices = sampling or PixelSampling()
+        of_mask = choices.mask_temperature or self.config.mask_temperature
         uniform = torch.stack([torch.rand(size, generator=rng) for rng in rngs])
         shares = self.mask.noise.shares(choices.mask_correlation)
         for numbers, rng in zip(uniform, rngs, strict=True):
@@ -279,7 +284,7 @@ class PixelDecoder(RayNetwork):
             part = slice(first, first + step)
             some = guide.part(part)
             with autocast_to(choices.precision, device):
-                mask = self.mask.sample(some, uniform[part, 0], condition[part])
+                mask = self.mask.sample(some, uniform[part, 0], condition[part], of_mask)
                 range_m = self._sample_range(some, uniform[part, 1:], mask, condition[part], choices)
             reflectance = None if decoded is None or decoded.reflectance is None else decoded.reflectance[part]
             own = slice(self.sensor.height)

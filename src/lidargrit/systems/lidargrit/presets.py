@@ -153,6 +153,7 @@ _BESIDE_FINE_CELLS = replace(
     weighed_components=True,
     range_temperature=0.2,  # for pixels that learn beside true neighbours last
     surface_temperature=0.5,  # tokens tell where thin objects stand, which are lost without them
+    mask_temperature=0.3,  # windows are salt and pepper at 1
 )
 _FOR_A_DEMO = {
     "data.train": ("simulated:256:train",),
