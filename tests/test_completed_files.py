@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -210,6 +211,31 @@ def test_intensity_of_a_completed_las_is_what_it_was(tmp_path, is_own):
     assert again.full_scale == read.full_scale
 
 
+@pytest.mark.parametrize(("kind", "angle"), [(3, "scan_angle_rank"), (5, "user_data"), (7, "scan_angle")])
+def test_a_completed_las_keeps_class_colour_and_dimensions_of_its_own(kind, angle, tmp_path):
+    laspy = pytest.importorskip("laspy")
+    scan = unproject(street(SIXTEEN))
+    cloud = laspy.LasData(laspy.LasHeader(version="1.4", point_format=kind))
+    cloud.header.scales = np.full(3, 0.001)
+    cloud.header.add_extra_dims([laspy.ExtraBytesParams("echo width", np.float32)])
+    cloud = laspy.LasData(cloud.header)
+    cloud.xyz, number = scan.points_xyz_m.double().numpy(), np.arange(len(scan))
+    for name in ("classification", "red", "blue", "return_number", "point_source_id", "echo width", angle):
+        cloud[name] = number % (256 if kind == 7 and name == "classification" else 7)
+    cloud.gps_time = number * 1e-6
+    cloud.write(str(tmp_path / "in.las"))
+    done = CompletedScan(read := read_scan(tmp_path / "in.las"), torch.arange(len(read)) > 9)
+    write_cloud(tmp_path / "a.las", "", replace(done, filled=read.select(torch.arange(10))), formats.load("las"))
+    after = laspy.read(tmp_path / "a.las")
+    assert len(after) == len(scan)
+    for name in {*cloud.point_format.dimension_names} - {"X", "Y", "Z"}:
+        if "wave" not in name and not name.endswith("_t"):
+            assert np.array_equal(cloud[name][10:], after[name][:-10]), name
+    assert set(after["echo width"][-10:]) <= set(range(7)), "of the nearest measured point"
+    write_cloud(tmp_path / "a.ply", ".ply", done, None)
+    assert np.array_equal(columns_of_file(read_scan(tmp_path / "a.ply"))["red"], cloud.red[10:])
+
+
 @pytest.mark.parametrize("ending", [".pcd", ".ply", ".las", ".npz"])
 def test_columns_of_rare_types_and_names_are_written(ending, tmp_path):
     (form,) = formats.candidates(path := tmp_path / f"a{ending}")
@@ -220,7 +246,7 @@ def test_columns_of_rare_types_and_names_are_written(ending, tmp_path):
     form.write_columns(path, columns)
     again = read_scan(path)
     assert torch.equal(again.ring, scan.ring)
-    if ending in {".pcd", ".ply"}:
+    if ending != ".npz":
         assert np.array_equal(columns_of_file(again)["is_wet"], columns["is_wet"])
         assert np.array_equal(columns_of_file(again)["file"], columns["file"].astype(np.float64))
     if ending == ".npz":

@@ -22,7 +22,6 @@ from lidargrit.data.formats.shared.columns import (
     little_endian,
     scan_of_columns,
 )
-from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
 _FORMAT = "an uncompressed LAS file of version 1.0 to 1.4"
@@ -35,6 +34,13 @@ _RECORDS_AT_MOST = 1000  # of remarks between header and points; real files have
 _TIME = "gps_time"  # in seconds
 _STEP_M = 1e-4  # in which coordinates are kept: a twentieth of a sensor's own step, and 214 km in 32 bits
 _OURS = "lidargrit"  # the program that writes a file
+_POINT_FORMATS_WRITTEN = (0, 1, 2, 3, 6, 7, 8)  # those without wave packets, whose data are not read
+_NOT_READ = (
+    *("X", "Y", "Z"),  # in steps
+    *("wavepacket_index", "wavepacket_offset", "wavepacket_size", "return_point_wave_location", "x_t", "y_t", "z_t"),
+)
+_NAME_BYTES = 32  # of an extra dimension
+_EXTRAS_AT_MOST = 341  # of 192 bytes each in one record
 _KINDS = [f"{kind}{size}" for kind in "ui" for size in (1, 2, 4, 8)] + ["f4", "f8"]  # of extra dimensions
 _INTENSITY_STEPS = 65_535  # 16 bits, as the standard wants them
 _WRITTEN_ON = date(2000, 1, 1)  # the same scan gives the same bytes on every day
@@ -45,8 +51,8 @@ class Las(ColumnFormat):
 
     Reflectance is LAS's intensity, and none where all of it is 0, which is how LAS says so. Files that this program
     writes have it from 0 to 1, too, in an extra dimension of that name, as they have ring and label; the classes of LAS
-    are others than SemanticKITTI's and left alone. Files are written as version 1.4, point format 0 or, where points
-    have times, 1, with coordinates in steps of 0.1 mm.
+    are others than SemanticKITTI's, and only kept. Files are written as version 1.4 with coordinates in steps of
+    0.1 mm, in the first point format that has what is known of points: 0, or 1 where they have times.
 
     Source:
         LAS Specification 1.4 R15, American Society for Photogrammetry and Remote Sensing, 2019.
@@ -97,35 +103,57 @@ class Las(ColumnFormat):
         farthest_m = float(np.abs(xyz_m).max())
         if farthest_m >= _STEP_M * np.iinfo(np.int32).max:
             raise OutputError(f"a coordinate of {farthest_m:g} m", "at most 214 km", "choose .ply")
-        header = laspy.LasHeader(version="1.4", point_format=1 if _TIME in columns else 0)
+        columns = {name: values for name, values in columns.items() if name not in ("x", "y", "z")}
+        intensity = columns.pop("intensity", None)
+        if intensity is not None and intensity.dtype.kind == "f":  # it alone does not say what its full scale is
+            columns["reflectance"], intensity = intensity.astype(np.float32), _steps(intensity)
+        kinds = map(laspy.PointFormat, _POINT_FORMATS_WRITTEN)
+        chosen = min(kinds, key=lambda kind: sum(not _fits(*column, kind) for column in columns.items()))
+        header = laspy.LasHeader(version="1.4", point_format=chosen.id)
         header.scales, header.offsets = np.full(3, _STEP_M), np.zeros(3)
         header.generating_software, header.creation_date = _OURS, _WRITTEN_ON
-        others = {name: values for name, values in columns.items() if name not in (_TIME, "intensity")}
-        extra = {name: little_endian(values, _KINDS) for name, values in others.items() if known_name(name)}
-        intensity = columns.get("intensity")
-        if intensity is not None and intensity.dtype.kind == "f":  # it alone does not say what its full scale is
-            extra["reflectance"], intensity = intensity.astype(np.float32), _steps(intensity)
+        own = {name: values for name, values in columns.items() if _fits(name, values, chosen)}
+        extra = {name: values for name, values in columns.items() if name not in own}
+        extra = _extra_dimensions(extra, chosen, path)
         header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()])
-        cloud: Any = laspy.LasData(header)
-        cloud.xyz = xyz_m
-        if intensity is not None:
-            cloud.intensity = intensity
-        if _TIME in columns:
-            cloud[_TIME] = columns[_TIME].astype(np.float64)
-        for name, values in extra.items():
-            cloud[name] = values
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            cloud.write(file, do_compress=False)
+        points = laspy.ScaleAwarePointRecord.zeros(len(xyz_m), header=header)
+        of_las = dict(zip("xyz", xyz_m.T, strict=True)) | ({} if intensity is None else {"intensity": intensity})
+        for name, values in {**of_las, **own, **extra}.items():
+            points[name] = values
+        with (
+            atomic_path(path) as temporary,
+            temporary.open("wb") as file,
+            laspy.LasWriter(file, header, do_compress=False, closefd=False) as writer,
+        ):
+            writer.write_points(points)
+
+
+def _fits(name: str, values: np.ndarray, kind: Any) -> bool:
+    """Return whether a column is a dimension of a point format, which holds all its values."""
+    own = next((one for one in kind.dimensions if one.name == name and name not in _NOT_READ), None)
+    if own is None or name == _TIME:
+        return own is not None
+    return values.dtype.kind in "iu" and own.min <= values.min(initial=0) and values.max(initial=0) <= own.max
+
+
+def _extra_dimensions(columns: Mapping[str, np.ndarray], kind: Any, path: Path) -> dict[str, np.ndarray]:
+    """Return columns in types and by names that extra dimensions of a point format can have."""
+    if len(columns) > _EXTRAS_AT_MOST:
+        got = f"{len(columns)} columns besides those of LAS for {path}"
+        raise OutputError(got, f"at most {_EXTRAS_AT_MOST}", "choose .ply")
+    taken = {"", *kind.dtype().names, *kind.dimension_names}
+    cut = {name: name.encode()[:_NAME_BYTES].decode(errors="ignore") for name in columns}
+    return {f"{cut[name]}_" if cut[name] in taken else cut[name]: little_endian(columns[name], _KINDS) for name in cut}
 
 
 def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
+    """Return coordinates and all else that is known of points: what LAS has no values of is 0 for all."""
     columns = {axis: np.asarray(points[axis], dtype=np.float64) for axis in "xyz"}
-    intensity = np.asarray(points["intensity"])
-    if intensity.any():
-        columns["intensity"] = intensity
-    for name in (*points.point_format.extra_dimension_names, *{_TIME} & {*points.point_format.dimension_names}):
+    of_las, intensity = {*points.point_format.standard_dimension_names}, np.asarray(points["intensity"])
+    for name in points.point_format.dimension_names:
         values = np.asarray(points[name])
-        if known_name(name) and values.ndim == 1:
+        is_known = name not in of_las or name == _TIME or values.any()
+        if name not in _NOT_READ and values.ndim == 1 and is_known:
             columns[name] = values
     if ours and "reflectance" in columns:
         off = np.abs(intensity - _steps(columns["reflectance"]).astype(np.int64))
