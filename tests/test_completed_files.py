@@ -252,3 +252,14 @@ def test_columns_of_rare_types_and_names_are_written(ending, tmp_path):
     if ending == ".npz":
         with np.load(path) as archive:
             assert np.array_equal(archive["points_"], columns["points"])
+
+
+def test_clouds_of_other_columns_than_the_sensor_beside_them_are_told_once(tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    for name, columns in {"a": 64, "b": 128, "c": 256}.items():
+        formats.load("ply").write(tmp_path / f"in/{name}.ply", unproject(street(DENSE.fine().with_columns(columns))))
+    (tmp_path / "own.json").write_text(json.dumps(DENSE.fine().with_columns(64).to_json()))
+    words = ["--model", "nearest", "--sensor", f"{tmp_path}/own.json"]
+    assert main(["complete", f"{tmp_path}/in", f"{tmp_path}/out", *words]) == 0
+    assert capsys.readouterr().err.count("columns and sensor.json") == 1
+    assert load_sensor(tmp_path / "out/sensor.json").width == 64

@@ -34,7 +34,7 @@ from lidargrit.data.formats import ScanFormat
 from lidargrit.data.formats.kitti_bin import KittiBin
 from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.motion import Motion
-from lidargrit.scans.sensors import SensorModel
+from lidargrit.scans.sensors import SensorModel, load_sensor
 from lidargrit.scans.types import Scan
 
 TREE = "kitti_odometry"  # the data set that reads such a tree back
@@ -93,7 +93,7 @@ class ScanFolder:
         self._facts = {**facts, "scans": {file: scan.name for file, scan in of_files.items()}}
         if states := {file: scan.state for file, scan in of_files.items() if scan.state}:
             self._facts["states"] = states
-        self._bad_scans, self._left_out, self._told_labels = bad_scans, set[str](), False
+        self._bad_scans, self._left_out, self._told = bad_scans, set[str](), set[str]()
         self.missing = [index for index, file in enumerate(files) if not (out / file).exists()]
 
     @property
@@ -147,13 +147,21 @@ class ScanFolder:
 
     def tell_labels_lost(self, file: str) -> None:
         """Tell, the first time, that a file by its ending keeps no labels."""
-        if not self._told_labels:
-            reporting.message(f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
-            self._told_labels = True
+        self._tell_once("labels", f"{Path(file).suffix} keeps no labels; --format {TREE} or npz keeps them")
 
-    def tell_sensor(self, sensor: SensorModel) -> None:
-        """Write beside the scans on which rays their points lie."""
+    def tell_sensor(self, sensor: SensorModel, file: str = "") -> None:
+        """Write beside the scans on which rays their points lie; tell, the first time, of a file with other columns."""
         write_sensor(self.out, sensor)
+        if file and (columns := load_sensor(self.out / SENSOR_FILE).width) != sensor.width:
+            text = f"WARNING: {file} has {sensor.width} columns and {SENSOR_FILE} the {columns} of other scans, with "
+            self._tell_once(
+                "columns", f"{text}which commands image all; give each sensor's scans a folder of their own"
+            )
+
+    def _tell_once(self, what: str, text: str) -> None:
+        if what not in self._told:
+            self._told.add(what)
+            reporting.message(text)
 
     def _claim(self) -> None:
         scans = self._facts["scans"]

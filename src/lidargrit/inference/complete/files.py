@@ -138,7 +138,7 @@ class _Completion:
         file = folder.files[job.index * output.count + job.turn]
         if output.probability and job.turn == 0:
             write_array(folder.out / _probability_file(file), _return_share(self.model, job, output))
-        folder.tell_sensor(self.sensor_of(job))
+        folder.tell_sensor(self.sensor_of(job), file)
         kept_labels, points = images.label is None, np.zeros(3, dtype=np.int64)
         if output.format == IMAGE:
             write_array(folder.out / file, images.range_m[0])
