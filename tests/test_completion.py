@@ -288,6 +288,21 @@ def test_models_and_settings_are_compared_on_hidden_parts(folders, tmp_path, cap
     assert "mask=guess" in capsys.readouterr().err
 
 
+def test_a_scan_of_which_nothing_is_observed_is_skipped_by_a_comparison(folders, tmp_path, capsys):
+    for name in ("a", "b", "c"):
+        image = street(SENSOR)
+        kept = image.return_mask & ((SENSOR.azimuth_rad.abs() > 0.3) if name == "a" else True)
+        NumpyArray.write(tmp_path / "in" / f"{name}.npz", unproject(RangeImage.masked(image.range_m, kept, SENSOR)))
+    words = ["compare", f"{tmp_path}/out", "nearest", "--protocol", "completion", "--reference", f"{tmp_path}/in"]
+    words += ["--sensor", f"{folders}/sensor.json", "--observed", "sector:-10,10", "rows:2"]
+    assert main(words) == 2
+    assert "of which --observed sector:-10,10 observes no return" in capsys.readouterr().err
+    assert main([*words, "--bad-scans", "skip"]) == 0
+    assert "left out: got " in capsys.readouterr().err
+    scores = json.loads((tmp_path / "out/completion.json").read_text())["scores"]
+    assert [score["num_scans"] for score in scores] == [2, 3]
+
+
 def test_the_drops_of_a_model_are_scored_beside_independent_ones(folders):
     model, true = load(folders / "run"), RangeImage.stack([street(SENSOR)] * 4)
     every = torch.ones_like(true.return_mask)

@@ -121,7 +121,8 @@ def _completions(options: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     sensor = settings.data.with_projection(sensor_for(source, settings.sensor)) if named else None
     models = open_models(words, sensor, options.device)
     images = images_for(models, scans, settings)
-    scores = compare_completion(images, models, patterns, options.samples, options.seed)
+    skips = settings.data.bad_scans == "skip"
+    scores = compare_completion(images, models, patterns, options.samples, options.seed, skips)
     found = {"reference": scans, "scores": [asdict(score) for score in scores]}
     write_json(file, found)
     return render(tables(scores), options.table), found

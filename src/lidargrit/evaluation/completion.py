@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import derive_seed, scan_seed
-from lidargrit.core.errors import ConfigError, DataError, UsageError, counted_scans
+from lidargrit.core.errors import ConfigError, DataError, UsageError, counted_scans, no_usable_scan
 from lidargrit.core.table import Table
 from lidargrit.data.images import RangeImages
 from lidargrit.evaluation.intervals import Estimate
@@ -21,6 +21,7 @@ from lidargrit.generation.semantic_classes import NUM_CLASSES, class_indices, cl
 from lidargrit.inference.complete import Model
 from lidargrit.inference.complete.patterns import Pattern
 from lidargrit.scans.condition import Observed
+from lidargrit.scans.many_scans import leaving_out
 from lidargrit.scans.projection import points_of_pixels
 from lidargrit.scans.types import RangeImage
 
@@ -76,7 +77,12 @@ class CompletionScore:
 
 
 def compare_completion(
-    images: RangeImages, models: Sequence[Model], patterns: Sequence[Pattern], completions: int = 2, seed: int = 0
+    images: RangeImages,
+    models: Sequence[Model],
+    patterns: Sequence[Pattern],
+    completions: int = 2,
+    seed: int = 0,
+    skips: bool = False,
 ) -> list[CompletionScore]:
     """Hide parts of scans, have every model fill them in, and compare.
 
@@ -85,6 +91,7 @@ def compare_completion(
         patterns: choices of the observed pixels; each scan has its own random pixels, the same for all models.
         completions: number of completions of each scan by a model that is random.
         seed: seed of the first completion, and of the random pixels.
+        skips: whether scans of which a pattern observes nothing, or all, are left out of its scores, with a message.
 
     Returns:
         scores of all models by the first pattern, then by the next.
@@ -99,14 +106,21 @@ def compare_completion(
     scores = []
     with reporting.progress("completing", len(patterns) * len(models)) as progress:
         for pattern in patterns:
-            masks = [pattern.mask(whole[at], derive_seed(seed, at), name) for at, name in enumerate(names)]
-            if not bool((whole.return_mask.cpu() & ~torch.stack(masks)).any()):
+            masks = dict[int, Tensor]()
+            for at, name in enumerate(names):
+                with leaving_out(skips):
+                    masks[at] = pattern.mask(whole[at], derive_seed(seed, at), name)
+            if not masks:
+                raise no_usable_scan(f"those that --observed {pattern.text} is to observe")
+            some, observed = whole[[*masks]], torch.stack([*masks.values()])
+            if not bool((some.return_mask.cpu() & ~observed).any()):
                 got = f"--observed {pattern.text}, which hides no return of these scans"
                 raise UsageError(got, "pixels that leave some returns out", "observe others, as rows:4")
-            condition = Observed.of_pixels(whole, torch.stack(masks))
+            condition = Observed.of_pixels(some, observed)
+            seeds = [[scan_seed(seed + turn, at) for at in masks] for turn in range(completions)]
             of_pattern = []
             for model in models:
-                of_pattern.append(_score(model, pattern, whole, condition, completions, seed))
+                of_pattern.append(_score(model, pattern, some, condition, seeds))
                 progress.advance(1, model.name)
             scores += _beside(of_pattern)
     return scores
@@ -151,13 +165,16 @@ def _check(model: Model, images: RangeImages) -> None:
 
 
 def _score(
-    model: Model, pattern: Pattern, whole: RangeImage, condition: Observed, completions: int, seed: int
+    model: Model, pattern: Pattern, whole: RangeImage, condition: Observed, seeds: Sequence[list[int]]
 ) -> tuple[CompletionScore, list[float]]:
-    """Return how well a model fills in a pattern, and its mean absolute error of each scan in metres."""
-    turns = completions if model.generator.is_random else 1
-    seeds = [[scan_seed(seed + turn, index) for index in range(len(whole))] for turn in range(turns)]
+    """Return how well a model fills in a pattern, and its mean absolute error of each scan in metres.
+
+    Args:
+        seeds: seeds of all scans for each completion; the first alone are of a model that is not random.
+    """
+    turns = len(seeds) if model.generator.is_random else 1
     begin = time.perf_counter()
-    filled = [model.complete(condition, of_turn) for of_turn in seeds]
+    filled = [model.complete(condition, of_turn) for of_turn in seeds[:turns]]
     seconds = (time.perf_counter() - begin) / (len(whole) * turns)
     hidden = ~condition.return_observed
 
