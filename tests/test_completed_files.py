@@ -254,6 +254,20 @@ def test_columns_of_rare_types_and_names_are_written(ending, tmp_path):
             assert np.array_equal(archive["points_"], columns["points"])
 
 
+@pytest.mark.parametrize("ending", [".pcd", ".ply"])
+def test_columns_whose_names_differ_in_blanks_or_lack_are_all_written(ending, tmp_path):
+    (form,) = formats.candidates(path := tmp_path / f"a{ending}")
+    columns = {name: np.arange(5.0) + number for number, name in enumerate(("x", "y", "z", "a b", "a_b", "a,b", ""))}
+    form.write_columns(path, columns)
+    again = columns_of_file(read_scan(path, bad_points="drop"))
+    assert {name: int(values[0]) for name, values in again.items() if name not in "xyz"} == {
+        "a_b_": 3,
+        "a_b": 4,
+        "a_b__": 5,
+        "_": 6,
+    }
+
+
 def test_clouds_of_other_columns_than_the_sensor_beside_them_are_told_once(tmp_path, capsys):
     (tmp_path / "in").mkdir()
     for name, columns in {"a": 64, "b": 128, "c": 256}.items():

@@ -16,7 +16,7 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
     check_lines,
-    one_word,
+    in_one_word,
     plain_text,
     scan_of_columns,
 )
@@ -84,14 +84,13 @@ class CsvTable(ColumnFormat):
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new file, numbers with all their digits."""
+        columns = in_one_word(columns)
         digits = {"f2": "%.9g", "f4": "%.9g", "f8": "%.17g"}
         form = [digits.get(of.dtype.str[1:], "%d") for of in columns.values()]
         # Not as doubles, which do not hold the nanoseconds of a clock.
         table = np.rec.fromarrays([*columns.values()], [(name, of.dtype) for name, of in columns.items()])
         with atomic_path(path) as temporary:
-            np.savetxt(
-                temporary, table, form, ",", header=",".join(map(one_word, columns)), comments="", encoding="utf-8"
-            )
+            np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="utf-8")
 
 
 def _utf_8(data: bytes) -> bytes:

@@ -14,8 +14,8 @@ from lidargrit.data.formats.shared.columns import (
     BYTES_AT_MOST,
     ColumnFormat,
     begins_as,
+    in_one_word,
     little_endian,
-    one_word,
     scan_of_columns,
     text_rows,
     whole_number,
@@ -64,7 +64,7 @@ class Pcd(ColumnFormat):
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new binary file."""
-        columns = {one_word(name): little_endian(values, _KINDS) for name, values in columns.items()}
+        columns = {name: little_endian(values, _KINDS) for name, values in in_one_word(columns).items()}
         rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
         lines = {
             "VERSION": "0.7",

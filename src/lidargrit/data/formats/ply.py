@@ -16,8 +16,8 @@ from lidargrit.data.formats.shared.columns import (
     ColumnFormat,
     begins_as,
     check_lines,
+    in_one_word,
     little_endian,
-    one_word,
     plain_text,
     scan_of_columns,
     text_rows,
@@ -90,7 +90,7 @@ class Ply(ColumnFormat):
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
         """Write columns to a new binary file; whole numbers of 64 bits, which PLY has not, as doubles."""
-        columns = {one_word(name): little_endian(values, _TYPE_NAMES) for name, values in columns.items()}
+        columns = {name: little_endian(values, _TYPE_NAMES) for name, values in in_one_word(columns).items()}
         lines = [f"property {_TYPE_NAMES[values.dtype.str[1:]]} {name}" for name, values in columns.items()]
         count = len(next(iter(columns.values())))
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *lines, "end_header", ""]

@@ -80,9 +80,15 @@ def columns_of(scan: Scan) -> dict[str, np.ndarray]:
     return columns
 
 
-def one_word(name: str) -> str:
-    """Return the name of a column as headers of text can hold it: blanks and signs between names would make two."""
-    return _BETWEEN_NAMES.sub("_", name)
+def in_one_word(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return columns by names that headers of text can hold: blanks and signs between names would make two of one."""
+    renamed = dict[str, np.ndarray]()
+    for name, values in columns.items():
+        word = _BETWEEN_NAMES.sub("_", name) or "_"
+        while word in renamed or (word != name and word in columns):
+            word += "_"
+        renamed[word] = values
+    return renamed
 
 
 def little_endian(values: np.ndarray, kinds: Collection[str]) -> np.ndarray:
