@@ -6,6 +6,7 @@ to that file besides the table. Progress, warnings and "done" are then on standa
 
 import argparse
 import json
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -18,6 +19,12 @@ from lidargrit.core.files import plain, refuse_to_overwrite, write_json
 from lidargrit.core.untrusted import check_path
 
 STANDARD_OUTPUT = Path("-")
+_OF_FOLDERS = (
+    *("run", "config", "trained_on", "bundle", "plan", "scans"),  # of runs and of prepared scans
+    *("samples", "drive", "completed", "segmented", "simulated", "export", "decompressed", "sensor"),  # of scans
+    *("table", "completion", "costs"),  # of comparisons
+)
+"""What files that the program itself keeps in folders are called, each ``.json``."""
 
 
 def look_at(folder: Path) -> str:
@@ -33,11 +40,17 @@ def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json")
     parser.add_argument("--overwrite", action="store_true", help=f"replace {files}")
 
 
-def refuse_taken(options: argparse.Namespace, *others: Path) -> None:
-    """Refuse, before any work, to replace a file that ``--json`` names, or ``others`` of the verb, with OutputError."""
+def refuse_taken(options: argparse.Namespace) -> None:
+    """Refuse, before any work, to replace a file that ``--json`` names, or one of the verb's own, with OutputError."""
     if options.json in (None, STANDARD_OUTPUT):
         return
-    if options.json.absolute() in {other.absolute() for other in others}:
+    words = [word for value in vars(options).values() for word in (value if isinstance(value, list) else [value])]
+    texts = [str(word) for word in words if isinstance(word, (str, Path)) and word is not options.json]
+    named = {Path(os.path.abspath(part)) for text in texts for part in (text, *text.split(":")) if part}  # DATA:ROOT
+    file = Path(os.path.abspath(options.json))
+    is_kept = file.stem in _OF_FOLDERS and not named.isdisjoint(file.parents)
+    is_of_system = file.stem == file.parent.name and file.parent.parent in named  # in the folder of a comparison
+    if file in named or is_kept or is_of_system:
         raise OutputError(f"{options.json} for two files", "a name for each", "choose another name for --json")
     refuse_to_overwrite(options.json, options.overwrite, ".json")
 
