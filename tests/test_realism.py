@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -128,6 +129,14 @@ def test_the_picture_has_every_panel(scores, tmp_path):
     assert heights[0] > heights[1] > 300
     with pytest.raises(ConfigError, match=r"^got no curve; wanted at least one"):
         plot_curves([], tmp_path / "none.png")
+
+
+def test_ranges_at_which_no_row_has_a_value_are_gaps_in_a_picture(scores, tmp_path):
+    deep = next(score for score in scores if np.ndim(score.own.details.get("real")) == 2)
+    nowhere = np.full_like(np.array(deep.own.details["generated"], dtype=float), np.nan)
+    own = replace(deep.own, details={**deep.own.details, "generated": nowhere})
+    plot_curves([replace(deep, own=own)], tmp_path / "gaps.png")
+    assert (tmp_path / "gaps.png").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("rows", [32, 64])

@@ -111,7 +111,7 @@ def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
     figure.text(box.x0, box.y1 + 0.35 / figure.get_figheight(), _title(score), fontsize=10)
     axes = figure.add_subplot(grid[0, 3])
     for which, colour in _SIDES.items():
-        values = np.sort(images[which].ravel())[::-1] if is_map else np.nanmean(images[which], axis=0)
+        values = np.sort(images[which].ravel())[::-1] if is_map else _mean_over_rows(images[which])
         axes.plot(np.arange(1, len(values) + 1) if is_map else axis, values, color=colour, label=which, linewidth=1.2)
     if is_map:
         axes.set(xscale="log", xlabel="rank of the cell")
@@ -122,3 +122,10 @@ def _plot_images(figure: Figure, cell: SubplotSpec, score: CurveScore) -> None:
         axes.set_title("mean over rows", loc="left", fontsize=10)
     axes.grid(alpha=0.3, linewidth=0.5)
     axes.legend(fontsize=9)
+
+
+def _mean_over_rows(image: Float64[np.ndarray, "rows n"]) -> Float64[np.ndarray, "n"]:
+    """Return the mean of what is known of the rows; NaN, a gap in the line, where that is nothing."""
+    known = np.isfinite(image)
+    count = known.sum(axis=0)
+    return np.where(count > 0, np.where(known, image, 0).sum(axis=0) / count.clip(1), np.nan)
