@@ -223,8 +223,9 @@ def test_the_commands(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = ["evaluate", REAL, "--save-reference", "a.lgref", "--metrics", "bev_jsd", "--intervals", "0"]
     made += ["--set", "data.columns=128", "data.column_stride=2"]
-    assert main(made) == 0
+    assert main([*made, "--json", "facts.json"]) == 0
     out = capsys.readouterr().out
+    assert out.endswith("done: facts in facts.json\n")
     assert "score with: lidargrit evaluate SAMPLES a.lgref --protocol exact" in out
     assert main(made) == 2
     assert "which is there already" in the_one_line(capsys.readouterr().err, "evaluate")

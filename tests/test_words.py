@@ -38,6 +38,7 @@ MISTAKES = {
     "list --json datasets": "got --json datasets; wanted a name in .json, or nothing; put --json last",
     "doctor --json facts.txt": "got --json facts.txt; wanted a name in .json",
     "train lidargrit_demo run --json": "got --json for a training; wanted --dry-run or --measure beside it;",
+    "--print-completion bash doctor": "got --print-completion bash before doctor; wanted one of them; leave doctor out",
     "--print-completion tcsh": "got --print-completion tcsh; wanted bash, zsh or fish; choose one",
     "sample nowhere out --device cuda:99": "got device 'cuda:99'; wanted one that PyTorch finds",
     "evaluate nowhere nowhere --device abacus": "got device 'abacus'; wanted one that PyTorch finds",

@@ -164,6 +164,9 @@ def _parsed(parser: Parser, words: list[str]) -> argparse.Namespace:
     options, too_many = parser.parse_known_args(words)
     if too_many:
         (options.words if options.verb else parser).refuse(too_many[0])
+    if options.verb and options.print_completion:
+        got = f"--print-completion {options.print_completion} before {options.verb}"
+        raise UsageError(got, "one of them", f"leave {options.verb} out")
     return options
 
 

@@ -48,4 +48,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     refuse_taken(options)
     text, values, also = evaluated(options)
-    print_result(options, text, values, files_told(scores=options.json, report=options.report), also)
+    found = {"facts" if options.save_reference else "scores": options.json}
+    print_result(options, text, values, files_told(**found, report=options.report), also)
