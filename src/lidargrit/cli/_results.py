@@ -40,9 +40,17 @@ def add_json(parser: argparse.ArgumentParser, files: str = "the file of --json")
     parser.add_argument("--overwrite", action="store_true", help=f"replace {files}")
 
 
-def refuse_taken(options: argparse.Namespace) -> None:
-    """Refuse, before any work, to replace a file that ``--json`` names, or one of the verb's own, with OutputError."""
+def refuse_taken(options: argparse.Namespace, replaces_others: bool = False) -> None:
+    """Refuse, before any work, to replace a file that ``--json`` names, or one of the verb's own, with OutputError.
+
+    Args:
+        options: parsed options with ``json``, see :func:`add_json`.
+        replaces_others: whether ``--overwrite`` is for other files of the verb, too, and may stand without this one.
+    """
     if options.json in (None, STANDARD_OUTPUT):
+        if options.overwrite and not replaces_others:
+            wanted, cure = "--json FILE.json, which alone it replaces", "leave it out, or choose another folder"
+            raise UsageError("--overwrite without a file of --json", wanted, cure)
         return
     words = [word for value in vars(options).values() for word in (value if isinstance(value, list) else [value])]
     texts = [str(word) for word in words if isinstance(word, (str, Path)) and word is not options.json]

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from lidargrit.cli._comparison import DEFAULTS, compared
+from lidargrit.cli._comparison import COMPLETION, DEFAULTS, compared
 from lidargrit.cli._options import add_device, add_scans
 from lidargrit.cli._results import add_json, print_result, refuse_taken
 from lidargrit.core.untrusted import WholeNumber, process_count, seed_number, whole_number
@@ -48,5 +48,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    refuse_taken(options)
+    refuse_taken(options, options.protocol == COMPLETION)
     print_result(options, *compared(options))

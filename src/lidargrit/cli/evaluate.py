@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    refuse_taken(options)
+    refuse_taken(options, replaces_others=True)
     text, values, also = evaluated(options)
     found = {"facts" if options.save_reference else "scores": options.json}
     print_result(options, text, values, files_told(**found, report=options.report), also)

@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
 
     refuse_to_overwrite(options.out, options.overwrite, ".json")
     refuse_to_overwrite(options.picture, options.overwrite, ".png")
-    refuse_taken(options)
+    refuse_taken(options, replaces_others=True)
     name = options.out.stem if options.name is None else options.name
     config = scan_settings(options).data
     dataset = open_source(options.scans, config.bad_points).scans()

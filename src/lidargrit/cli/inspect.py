@@ -30,7 +30,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.viewer.inspection import plot_inspection
 
     refuse_to_overwrite(options.out, options.overwrite, ".png")
-    refuse_taken(options)
+    refuse_taken(options, replaces_others=True)
     settings = scan_settings(options)
     scan, of_data_set = first_scan(options.scans, settings.data)
     name = settings.sensor or of_data_set or closest_sensor(scan)

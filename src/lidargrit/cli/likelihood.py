@@ -31,7 +31,7 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.data.sources.scan_sensor import sensor_for_run
     from lidargrit.evaluation.likelihood import measure_source
 
-    refuse_taken(options)
+    refuse_taken(options, replaces_others=True)
     refuse_to_overwrite(options.map, options.overwrite, ".npy")
     named = (options.scans, options.model, options.step_mm)
     settings = scan_settings(options, max_scans=options.count)

@@ -34,10 +34,14 @@ def run(options: argparse.Namespace) -> None:
     from lidargrit.generation.generator import load_class
     from lidargrit.generation.presets import load_preset
 
+    if options.json and not (options.dry_run or options.measure):
+        raise ConfigError(
+            "--json for a training", "--dry-run or --measure beside it", "read RUN/STAGE/log.jsonl instead"
+        )
+    refuse_taken(options)
     words, automatic = training.without_auto(scan_words(options))
     preset = training.with_best_batches(load_preset(options.preset, words), automatic, options.out)
     if options.dry_run or options.measure:
-        refuse_taken(options)
         training.check_folder(options.out, preset)
         planned = training.plan_training(preset)
         measured = training.measure(preset, planned.flops) if options.measure else []
@@ -45,10 +49,6 @@ def run(options: argparse.Namespace) -> None:
         print_result(options, text, {**planned.to_json(), "measured": [vars(stage) for stage in measured]})
         training.open_data(preset)  # last: the plan of a preset is worth reading on a machine without its data too
         return
-    if options.json:
-        raise ConfigError(
-            "--json for a training", "--dry-run or --measure beside it", "read RUN/STAGE/log.jsonl instead"
-        )
     from lidargrit.viewer import plot_progress  # matplotlib, which a plan does not need
 
     training.train(preset, options.out, plot_progress, options.wandb)
