@@ -6,6 +6,8 @@ from dataclasses import replace
 import torch
 
 from lidargrit.scans.fit_sensor import fit_sensor
+from lidargrit.scans.fit_sensor.points import Points
+from lidargrit.scans.fit_sensor.rings import recover_rings
 from lidargrit.scans.sensors import load_sensor
 from lidargrit.scans.types import Scan
 from test_fit_sensor import room
@@ -22,3 +24,9 @@ def test_a_sensor_that_the_package_has_is_named_and_a_mirrored_file_told():
     lifted = replace(sensor, elevation_rad=sensor.elevation_rad + math.radians(1))
     others = [room(lifted, seed) for seed in range(5)]
     assert not any("the package has" in note for note in fit_sensor(others).warnings)
+
+
+def test_a_file_in_which_every_other_beam_did_not_return_is_read_without_a_warning():
+    azimuth_rad, range_m = torch.linspace(0, 6.28, 600), torch.tensor([10.0, 0.3]).repeat(300)  # near: no angle
+    points_m = torch.stack((azimuth_rad.cos(), azimuth_rad.sin(), -0.1 - 0.1 * azimuth_rad), dim=1) * range_m[:, None]
+    assert recover_rings([Points.of_scan(Scan(points_m))]) is None

@@ -1,5 +1,6 @@
 """The laser of each point: scans → ring numbers, by a field of the files or by the order of their points."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -99,7 +100,7 @@ def _column_by_column(scans: Sequence[Points]) -> Rings | None:
     elevation = np.full(first.num_in_file, np.nan)
     elevation[first.index] = first.elevation_deg
     lags = range(2, min(_LASERS_AT_MOST, first.num_in_file // 8) + 1)
-    change = np.array([float(np.nanmedian(np.abs(elevation[lag:] - elevation[:-lag]))) for lag in lags])
+    change = np.array([_median_of_known(np.abs(elevation[lag:] - elevation[:-lag])) for lag in lags])
     same = change < _SAME_ELEVATION * float(np.median(change))  # multiples of the number of lasers come again as well
     lasers = next((lag for lag, again in zip(lags, same, strict=True) if again), None)
     if lasers is None or any(points.num_in_file % lasers for points in scans):
@@ -107,6 +108,12 @@ def _column_by_column(scans: Sequence[Points]) -> Rings | None:
     numbers = tuple(points.index % lasers for points in scans)
     turning, start = _turning(scans, numbers)
     return Rings("column by column", numbers, tuple(range(len(scans))), turning, start, lasers)
+
+
+def _median_of_known(values: Float64[np.ndarray, "n"]) -> float:
+    """Return the median of values without NaN, as is where a beam did not return; NaN where all are."""
+    known = values[~np.isnan(values)]
+    return float(np.median(known)) if len(known) else math.nan
 
 
 def _turning(scans: Sequence[Points], numbers: Sequence[Int64[np.ndarray, "_"]]) -> tuple[bool | None, float | None]:
