@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced, scan_seed
-from lidargrit.core.errors import ConfigError, DataError
+from lidargrit.core.errors import ConfigError, DataError, counted_scans
 from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
 from lidargrit.data.pasts import Pasts
@@ -133,9 +133,9 @@ def evaluate_forecast(source: str, config: EvalConfig, model: str = "") -> tuple
             tables.append(Table(sentences=(lacking,)))
             continue
         rows = {name: _estimates(each) for name, each in errors.items()}
-        left_out = (f"{standing} scans of a standing car are left out",) if standing else ()
+        left_out = (f"{counted_scans(standing)} of a standing car left out",) if standing else ()
         cells = tuple((name, *(each.as_text(".3f") for each in row.values())) for name, row in rows.items())
-        tables.append(Table(("forecast", *measured.heads), cells, f"{title}: {count} scans", notes=left_out))
+        tables.append(Table(("forecast", *measured.heads), cells, f"{title}: {counted_scans(count)}", notes=left_out))
         plain = {name: {key: vars(each) for key, each in row.items()} for name, row in rows.items()}
         at = {"horizon_s": horizons_s[-1], "horizons_s": list(horizons_s)}
         values.append({**at, "scans": count, "standing": standing, "forecasts": plain})

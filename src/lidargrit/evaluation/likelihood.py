@@ -10,7 +10,7 @@ import numpy as np
 
 from lidargrit.core import reporting
 from lidargrit.core.determinism import evenly_spaced
-from lidargrit.core.errors import DataError, ScanError
+from lidargrit.core.errors import DataError, ScanError, counted_scans
 from lidargrit.core.files import atomic_path
 from lidargrit.core.table import Table, render
 from lidargrit.data.images import RangeImages
@@ -78,7 +78,7 @@ class Likelihood:
         rows = [(part, *(_as_text(units[unit]) for unit in _UNITS)) for part, units in self.estimates().items()]
         returns = f"{sum(self.returns) / len(self.returns):,.0f} returns a scan"
         steps = f"ranges in steps of {self.step_mm} mm"
-        notes = [f"{len(self.names)} scans, {returns}, {steps}; 95 % intervals over scans"]
+        notes = [f"{counted_scans(len(self.names))}, {returns}, {steps}; 95 % intervals over scans"]
         if not self.is_whole:
             notes.append("tokens alone: this model has no probabilities of returns and ranges (no pixel decoder)")
         return Table(("bits", *_UNITS.values()), tuple(rows), notes=tuple(notes))

@@ -164,7 +164,7 @@ def as_table(inspection: Inspection) -> str:
         Table(
             ("pixels filled", *_filling(filled)),
             tuple(quarters),
-            notes=(f"{len(empty)} rows are empty: {shown}",) if len(empty) else (),
+            notes=(f"{len(empty)} {'rows are' if len(empty) > 1 else 'row is'} empty: {shown}",) if len(empty) else (),
         ),
     ]
     if errors:
