@@ -375,22 +375,6 @@ def test_metrics_of_which_none_can_be_made_are_refused_before_training(tmp_path,
         run_comparison(["marginal"], tmp_path / "table", COMPARISON)
 
 
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [
-        (["compare", "OUT", "marginal"], "OUT/table.json"),
-        (["compare", "OUT", "marginal"], "OUT/marginal/marginal.json"),
-        (["segment", "simulated:2:val", "OUT"], "OUT/segmented.json"),
-        (["evaluate", "simulated:2:val", "drives:OUT:val"], "OUT/samples/samples.json"),
-        (["prepare", "simulated:2:val", "-o", "OUT"], "OUT/plan.json"),
-    ],
-)
-def test_json_is_not_written_over_what_a_folder_of_the_command_keeps(words, name, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main([*words, "--overwrite", "--json", name]) == 2
-    assert f"{name} for two files" in the_one_line(capsys.readouterr().err, words[0])
-
-
 def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
     with claim_folder(tmp_path), pytest.raises(OutputError, match=r"which process \d+ on .* is writing"):
         run_comparison(["marginal"], tmp_path, COMPARISON)
