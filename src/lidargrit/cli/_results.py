@@ -56,7 +56,7 @@ def refuse_taken(options: argparse.Namespace, replaces_others: bool = False) -> 
     texts = [str(word) for word in words if isinstance(word, (str, Path)) and word is not options.json]
     named = {Path(os.path.abspath(part)) for text in texts for part in (text, *text.split(":")) if part}  # DATA:ROOT
     file = Path(os.path.abspath(options.json))
-    is_kept = file.stem in _OF_FOLDERS and not named.isdisjoint(file.parents)
+    is_kept = file.stem in _OF_FOLDERS and not named.isdisjoint(file.parents if file.is_file() else [file.parent])
     is_of_system = file.stem == file.parent.name and file.parent.parent in named  # in the folder of a comparison
     if file in named or is_kept or is_of_system:
         raise OutputError(f"{options.json} for two files", "a name for each", "choose another name for --json")
