@@ -87,6 +87,12 @@ def test_a_last_laser_of_a_few_points_is_found(count):
     assert apart_m(CODEC.decompress(CODEC.compress(Cloud(cut, None))).points_m, cut) <= 0.01
 
 
+def test_a_point_straight_above_the_sensor_does_not_hide_the_lasers_of_the_others():
+    points_m = revolution(MOTION)
+    bits = [8 * len(CODEC.compress(Cloud(each, None))) for each in (points_m, np.insert(points_m, 400, [0, 0, 1.5], 0))]
+    assert bits[1] < 1.01 * bits[0]
+
+
 @settings(max_examples=25, deadline=None)
 @given(arrays(np.float32, st.tuples(st.integers(1, 60), st.just(3)), elements=COORDINATES), st.sampled_from([4, 20]))
 def test_any_points_come_back_in_their_cells(points_m, step_mm):

@@ -10,7 +10,7 @@ from copy import copy
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Complex128, Float64, Int64
+from jaxtyping import Bool, Complex128, Float64, Int64
 
 from lidargrit.inference.compress.firings import (
     LENGTH_M,
@@ -31,6 +31,7 @@ _ONE_IN = 4  # points is enough to find all that they have in common
 _ON_A_CONE_M = 0.002  # points off their laser's cone by less were not moved
 _OFF_AT_MOST_M = 0.02  # points off their rays: median beyond which this is no such file
 _BEFORE = 1024  # by which a row's first point may lie behind another that is as far around: a quarter of a unit
+_NEAREST_M = 0.1  # to the axis; nearer points tell no angle, and one alone would turn its laser's lines
 _TINY_M = 2e-4  # rounding to a millimetre moves points by this in the median
 _TURNS = np.arange(-0.1, 0.1, 0.0005)  # of the car in a revolution, in radians
 _ASIDE_M = np.arange(-0.06, 0.0601, 0.002)
@@ -54,7 +55,7 @@ def fit_firings(points_m: Points) -> Fitted | None:
     row = _lasers(points_m)
     if row is None:
         return None
-    chosen = _some_of_each(row)
+    chosen = _some_of_each(row, np.hypot(*points_m[:, :2].T) > _NEAREST_M)
     some = _Fit(points_m[chosen], row[chosen])
     some.find_cones()
     some.find_angles()
@@ -72,9 +73,10 @@ def _lasers(points_m: Points) -> Int64[np.ndarray, " n"] | None:
     return row
 
 
-def _some_of_each(row: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
-    """Return the numbers of a share of the points, among them at least one of every laser."""
+def _some_of_each(row: Int64[np.ndarray, " n"], tell: Bool[np.ndarray, " n"]) -> Int64[np.ndarray, " m"]:
+    """Return the numbers of a share of the points that tell an angle, and at least one of every laser."""
     chosen = np.arange(0, len(row), _ONE_IN)
+    chosen = chosen[tell[chosen]]
     lasers, first = np.unique(row, return_index=True)
     return np.sort(np.append(chosen, first[~np.isin(lasers, row[chosen])]))
 
@@ -97,7 +99,7 @@ class _Fit:
             x, y, _ = self._at_rest_m.T
             share = np.arctan2(y, x) / (2 * np.pi)
             share = np.clip(share - seen, -0.5, 0.5) * (np.abs(share - seen) <= 0.5) + seen
-        self._share, self._azimuth, self._flat_m = share, np.arctan2(y, x), np.hypot(x, y)
+        self._share, self._azimuth, self._flat_m = share, np.arctan2(y, x), np.maximum(np.hypot(x, y), _NEAREST_M)
 
     def find_cones(self) -> None:
         """Find the elevation and height of each laser, and of the motion what moves points off their cones."""
