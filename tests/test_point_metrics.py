@@ -280,6 +280,14 @@ def test_exact_divergence_is_scipys(seed):
     assert compare(first, first)[0] == 0
 
 
+def test_no_two_sets_are_beyond_the_bounds():
+    nothing_in_common = np.repeat(np.eye(2, dtype=np.int64), 5072, 1)
+    metric = load_metric("point_cloud_jsd")
+    for first, second in (nothing_in_common, np.eye(2, 10_144, dtype=np.int64)):
+        for variant in metric.variants:
+            assert 0.999 < metric(variant=variant).compare(first, second)[0] <= metric.bounds[1]
+
+
 def test_only_counts_are_kept():
     metric = load_metric("point_cloud_jsd")()
     for seed in range(3):
