@@ -121,14 +121,9 @@ def reconstructed(generator: Generator, images: RangeImage, sampling: TokenSampl
     return tokenizer.sample(tokens, rngs)
 
 
-def write_demo_page(demo: DemoPage, path: Path) -> None:
-    """Write the page; it needs no network and no other file."""
-    write_text(path, page(demo))
-
-
 @torch.no_grad()
-def page(demo: DemoPage) -> str:
-    """Return the page as text; names of files and other foreign text are escaped."""
+def write_demo_page(demo: DemoPage, path: Path) -> None:
+    """Write the page, which needs no network and no other file; names of files and other foreign text are escaped."""
     near, far = _limits_m(demo)
 
     def ranges(image: RangeImage, lattice: Lattice = _EVERY_PIXEL) -> tuple[str, str]:
@@ -164,7 +159,7 @@ def page(demo: DemoPage) -> str:
     looks = "".join(map(asset, ("page.css", "report.css", "demo.css")))
     title, scans = f"lidargrit demo: {demo.name}", interactive.as_json(demo.sets())
     script = interactive.opening_script() + "page.turn();\n"
-    return document(title, looks, content, script, scans, "data: blob:")
+    write_text(path, document(title, looks, content, script, scans, "data: blob:"))
 
 
 def _limits_m(demo: DemoPage) -> tuple[float, float]:

@@ -55,7 +55,6 @@ def subset_kernel_distance(
     first: Float[np.ndarray, "n d"],
     second: Float[np.ndarray, "m d"],
     seed: int,
-    subsets: int = _SUBSETS,
     at_most: int = _SUBSET_SIZE,
 ) -> float:
     """Return the mean kernel distance over pairs of equally large random subsets.
@@ -69,9 +68,9 @@ def subset_kernel_distance(
     rng = np.random.default_rng(seed)
     distances = (
         kernel_distance(*(features[rng.choice(len(features), size, replace=False)] for features in (first, second)))
-        for _ in range(subsets)
+        for _ in range(_SUBSETS)
     )
-    return sum(distances) / subsets
+    return sum(distances) / _SUBSETS
 
 
 def _kernel_sum(first: np.ndarray, second: np.ndarray) -> float:
