@@ -141,9 +141,12 @@ def test_a_wall_is_met_at_its_true_range_wherever_the_car_has_moved():
     assert warped.nearest.age_s[0][seen].unique().tolist() == [0.5]
 
 
-def test_without_motion_the_past_is_the_present():
-    past = some_past(1)
-    latest = Past(past.range_m[:, 2:], torch.eye(4).double()[None, None], past.ages_s[:, 2:], SENSOR)
+@pytest.mark.parametrize("highest_deg", [6, 89.5])
+def test_without_motion_the_past_is_the_present(highest_deg):
+    past, elevation_rad = some_past(1), SENSOR.elevation_rad.clone()
+    elevation_rad[0] = math.radians(highest_deg)  # as of a dome, whose upper row reaches beyond the zenith
+    sensor = replace(SENSOR, elevation_rad=elevation_rad)
+    latest = Past(past.range_m[:, 2:], torch.eye(4).double()[None, None], past.ages_s[:, 2:], sensor)
     returned = latest.range_m[0, 0, :, ::STRIDE] > 0
     ours_m = warp(latest).aligned.range_m[0].float()
     torch.testing.assert_close(ours_m[returned], latest.range_m[0, 0, :, ::STRIDE][returned])

@@ -145,7 +145,8 @@ def _rays_of(sensor: SensorModel, device: torch.device) -> _Rays:
         edges_rad = [2 * row_rad[0] - edges_rad[0], *edges_rad, 2 * row_rad[-1] - edges_rad[-1]]
     else:
         edges_rad = [row_rad[0] + _LONE_ROW_RAD / 2, row_rad[0] - _LONE_ROW_RAD / 2]
-    edge_sine, _ = _sine_and_cosine(torch.tensor(edges_rad[::-1], dtype=torch.float64))
+    rising_rad = torch.tensor(edges_rad[::-1], dtype=torch.float64)
+    edge_sine, _ = _sine_and_cosine(rising_rad.clamp(-math.pi / 2, math.pi / 2))  # a row may reach beyond the zenith
     falling = torch.arange(sensor.width) * (2 * math.pi / sensor.width)
     first_rad = (continuous_azimuths_rad(sensor.azimuth_rad) + falling).mean(1).expand(sensor.height)
     fine, kept = _directions(sensor.fine()).to(device), _directions(sensor).to(device)
