@@ -212,11 +212,14 @@ def test_refuses_scans_that_show_no_sensor_in_one_line(what):
     assert what in str(caught.value)
 
 
-def test_refuses_rings_seen_from_another_place():
+def test_refuses_rings_seen_from_another_place_or_at_one_elevation():
     scan = simulate(0, load_sensor("vlp16").with_columns(300))
     moved = scan.points_xyz_m + torch.tensor([1.3, 0.0, 2.5])
     with pytest.raises(ScanError, match="own frame"):
         fit_sensor([Scan(moved, ring=scan.ring)])
+    assert scan.ring is not None
+    with pytest.raises(ScanError, match="and 40, both at"):
+        fit_sensor([Scan(scan.points_xyz_m, ring=scan.ring.where(torch.arange(len(scan)) != 5, 40))])
 
 
 def test_refuses_no_scans_and_no_name():

@@ -278,7 +278,11 @@ def _model(
     row_of_point: Sequence[Int64[np.ndarray, "_"]],
     rings: Rings,
 ) -> SensorModel:
-    offsets = None
+    elevation_rad, offsets = torch.from_numpy(np.radians(rows.elevation_deg)).float(), None
+    for above in (elevation_rad.diff() >= 0).nonzero().flatten().tolist():
+        one, other = sorted(rows.number[above : above + 2].tolist())
+        got = f"rings {one} and {other}, both at {rows.elevation_deg[above]:.2f} degrees of elevation"
+        raise ScanError(got, "a ring for each laser", "correct the rings of the files, or write them without any")
     if rings.lasers:
         offsets = offsets_deg(used, row_of_point, len(rows.number), rings.lasers)
         if offsets is not None and float(np.ptp(offsets)) < _SHIFT_ASIDE_DEG:
@@ -287,7 +291,7 @@ def _model(
     edge_rad = first_edge_rad(used, row_of_point, halved) if halved == columns else math.pi
     return SensorModel(
         name=name,
-        elevation_rad=torch.from_numpy(np.radians(rows.elevation_deg)).float()[:, None],
+        elevation_rad=elevation_rad[:, None],
         azimuth_rad=column_azimuths_rad(halved, first_edge_rad=edge_rad),
         range_min_m=NOISE_RANGE_M,
         range_max_m=farthest_m(np.concatenate([points.range_m for points in used])),
