@@ -147,8 +147,7 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
     colours, norm = scales.range_colours, scales.range_norm
     ranges.imshow(shown, cmap=colours, norm=norm, aspect="auto", interpolation="nearest", extent=extent)
     share = panel.return_mask.mean()
-    size = "x".join(map(str, panel.range_m.shape))
-    title = f"{panel.title}  ({size}, {share:.0%} of rays returned)"
+    title = f"{panel.title}  ({'x'.join(map(str, panel.range_m.shape))}, {share:.0%} of rays returned)"
     ranges.set_title(title, loc="left", fontsize=12, parse_math=False)
     ranges.set_xticks([])
     mask = axes(0.75, 0.45, 9.9, 1.05)
@@ -165,14 +164,12 @@ def _plot_row(figure: Figure, height: float, bottom: float, panel: _Panel, scale
         axis.set_ylabel(name, fontsize=10)
     view = axes(11.3, 0.45, 2.25, 2.25)
     x, y, z = panel.points_xyz_m.T
-    order = np.argsort(z)  # the highest on top, as seen from above
+    order, size = np.argsort(z), min(2.5, 30_000 / max(len(z), 1))  # the highest on top, as seen from above
     norm, colours = scales.height_norm, scales.height_colours
-    view.scatter(
-        y[order], x[order], c=z[order], s=min(2.5, 30_000 / max(len(z), 1)), linewidths=0, norm=norm, cmap=colours
-    )
+    view.scatter(y[order], x[order], c=z[order], s=size, linewidths=0, norm=norm, cmap=colours)
     if panel.filled is not None:
         x, y, _ = panel.points_xyz_m[panel.filled[panel.return_mask]].T
-        view.scatter(y, x, c=_FILLED, s=min(2.5, 30_000 / max(len(z), 1)), linewidths=0)
+        view.scatter(y, x, c=_FILLED, s=size, linewidths=0)
     view.plot(0, 0, marker="+", color="black", markersize=7)
     half = scales.half_view_m
     view.set(xlim=(half, -half), ylim=(-half, half), aspect="equal", facecolor="white")  # left is to the left
