@@ -181,9 +181,9 @@ def test_a_model_of_one_sensor_does_not_learn_from_others(tmp_path, capsys) -> N
     assert "own_sensors=true for 'marginal', whose networks know the rays of one sensor" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("sensor", [EVEN, ODD], ids=["cells of 16", "cells of 8"])
-def test_phases_of_other_sensors_leave_the_numbers_of_a_mask_uniform(sensor: SensorModel) -> None:
-    mask = random_decoder(EVEN).for_sensor(sensor).mask
+def test_phases_of_another_sensor_leave_the_numbers_of_a_mask_uniform() -> None:
+    """Cells of 8 are smaller than those that were learned from, of 16."""
+    mask = random_decoder(EVEN).for_sensor(ODD).mask
     mask.noise.sums[..., :2] = torch.tensor([50.0, 100.0])  # in all phases that any sensor has, pixels correlate
     numbers = mask.uniform(rngs(2000)).double()
     assert torch.special.ndtri(numbers).std(0).sub(1).abs().max() < 0.08  # 0.016 is the error of one
