@@ -96,3 +96,12 @@ def test_dim_scans_keep_their_reflectance(tmp_path):
     scan = Scan(torch.rand(5, 3) + 1, torch.tensor([0.0, 0.001, 0.002, 0.003, 0.0038]))
     LAS.write(tmp_path / "dim.las", scan)
     assert torch.equal(read_scan(tmp_path / "dim.las").reflectance, scan.reflectance)
+
+
+def test_columns_whose_names_las_cannot_tell_apart_are_all_kept(tmp_path):
+    """Names of extra dimensions have 32 bytes, and those of LAS itself are taken."""
+    names = ["a" * 33, "a" * 34, "ä" * 20, "ä" * 21, "X", "X_2", ""]
+    extra = {name: np.full(3, number, np.float32) for number, name in enumerate(names)}
+    LAS.write_columns(tmp_path / "a.las", dict.fromkeys("xyz", np.zeros(3, np.float32)) | extra)
+    read = laspy.read(tmp_path / "a.las")
+    assert sorted(float(read[name][0]) for name in read.point_format.extra_dimension_names) == [*range(len(names))]

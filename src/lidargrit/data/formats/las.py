@@ -141,9 +141,16 @@ def _extra_dimensions(columns: Mapping[str, np.ndarray], kind: Any, path: Path) 
     if len(columns) > _EXTRAS_AT_MOST:
         got = f"{len(columns)} columns besides those of LAS for {path}"
         raise OutputError(got, f"at most {_EXTRAS_AT_MOST}", "choose .ply")
-    taken = {"", *kind.dtype().names, *kind.dimension_names}
-    cut = {name: name.encode()[:_NAME_BYTES].decode(errors="ignore") for name in columns}
-    return {f"{cut[name]}_" if cut[name] in taken else cut[name]: little_endian(columns[name], _KINDS) for name in cut}
+    taken, renamed = {"", *kind.dtype().names, *kind.dimension_names}, dict[str, np.ndarray]()
+    for name, values in columns.items():
+        number, short = 1, name.encode()[:_NAME_BYTES].decode(errors="ignore")
+        while short in taken:
+            number += 1
+            end = f"_{number}"
+            short = name.encode()[: _NAME_BYTES - len(end)].decode(errors="ignore") + end
+        taken.add(short)
+        renamed[short] = little_endian(values, _KINDS)
+    return renamed
 
 
 def _columns(points: Any, ours: bool) -> dict[str, np.ndarray]:
