@@ -52,15 +52,21 @@ def refuse_taken(options: argparse.Namespace, replaces_others: bool = False) -> 
             wanted, cure = "--json FILE.json, which alone it replaces", "leave it out, or choose another folder"
             raise UsageError("--overwrite without a file of --json", wanted, cure)
         return
+    if _is_another_file(options):
+        raise OutputError(f"{options.json} for two files", "a name for each", "choose another name for --json")
+    refuse_to_overwrite(options.json, options.overwrite, ".json")
+
+
+def _is_another_file(options: argparse.Namespace) -> bool:
+    """Return whether the file of ``--json`` is named by another option, too, or is kept in a folder that is named."""
     words = [word for value in vars(options).values() for word in (value if isinstance(value, list) else [value])]
     texts = [str(word) for word in words if isinstance(word, (str, Path)) and word is not options.json]
     named = {Path(os.path.abspath(part)) for text in texts for part in (text, *text.split(":")) if part}  # DATA:ROOT
     file = Path(os.path.abspath(options.json))
-    is_kept = file.stem in _OF_FOLDERS and not named.isdisjoint(file.parents if file.is_file() else [file.parent])
+    folders = file.parents if file.is_file() else [file.parent]
+    is_kept = file.stem in _OF_FOLDERS and not named.isdisjoint(folders)
     is_of_system = file.stem == file.parent.name and file.parent.parent in named  # in the folder of a comparison
-    if file in named or is_kept or is_of_system:
-        raise OutputError(f"{options.json} for two files", "a name for each", "choose another name for --json")
-    refuse_to_overwrite(options.json, options.overwrite, ".json")
+    return file in named or is_kept or is_of_system
 
 
 def print_result(

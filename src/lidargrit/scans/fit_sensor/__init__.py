@@ -279,7 +279,8 @@ def _model(
     rings: Rings,
 ) -> SensorModel:
     elevation_rad, offsets = torch.from_numpy(np.radians(rows.elevation_deg)).float(), None
-    for above in (elevation_rad.diff() >= 0).nonzero().flatten().tolist():
+    if not bool((falls := elevation_rad.diff() < 0).all()):
+        above = int((~falls).nonzero()[0])
         one, other = sorted(rows.number[above : above + 2].tolist())
         got = f"rings {one} and {other}, both at {rows.elevation_deg[above]:.2f} degrees of elevation"
         raise ScanError(got, "a ring for each laser", "correct the rings of the files, or write them without any")
