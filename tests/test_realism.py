@@ -139,6 +139,14 @@ def test_ranges_at_which_no_row_has_a_value_are_gaps_in_a_picture(scores, tmp_pa
     assert (tmp_path / "gaps.png").stat().st_size > 1000
 
 
+def test_scans_without_any_drop_have_a_picture(scores, tmp_path):
+    runs = next(score for score in scores if score.own.details.get("axis_label", "").endswith("[pixels]"))
+    none = np.zeros_like(np.array(runs.own.details["real"], dtype=float))
+    result = replace(runs.own, details={**runs.own.details, "real": none, "generated": none})
+    plot_curves([replace(runs, own=result, bernoulli=result)], tmp_path / "none.png")
+    assert (tmp_path / "none.png").stat().st_size > 1000
+
+
 def test_only_views_from_above_are_plotted_as_maps(tmp_path, monkeypatch):
     """The histograms of a sensor of 32 rows are 32x32, too."""
     sensor = load_sensor("hdl32e")

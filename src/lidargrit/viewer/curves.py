@@ -76,7 +76,8 @@ def _plot_lines(axes: Axes, score: CurveScore) -> None:
     elif label.endswith("[m]"):
         _log_axis(axes)
     elif label.endswith("[pixels]"):
-        axes.set(xscale="log", yscale="log")  # long runs are rare
+        dropped = any((_curve(score, which) > 0).any() for which in _SIDES)
+        axes.set(xscale="log", yscale="log" if dropped else "linear")  # long runs are rare
     axes.grid(alpha=0.3, linewidth=0.5)
     axes.legend(fontsize=9)
 

@@ -26,9 +26,7 @@ class MaskNetwork(PhaseNetwork):
 
     context_channels = 4 * 2
 
-    def __init__(
-        self, config: PixelDecoderConfig, sensor: SensorModel, features: int, num_rows: int | None = None
-    ) -> None:
+    def __init__(self, config: PixelDecoderConfig, sensor: SensorModel, features: int, num_rows: int) -> None:
         widths = config.mask_width, config.mask_width
         super().__init__(config, sensor, features, config.mask_features, widths, 1, num_rows)
         self.row_bias = (

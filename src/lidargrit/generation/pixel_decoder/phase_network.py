@@ -192,7 +192,7 @@ class PhaseNetwork(nn.Module):
     Args:
         kept: number of channels of the tokenizer's features that it sees.
         sensor: sensor of the images, with absent rows if there are any.
-        num_rows: number of the sensor's own rows, if some are absent.
+        num_rows: number of the sensor's own rows; the others are absent.
     """
 
     def __init__(
@@ -203,11 +203,11 @@ class PhaseNetwork(nn.Module):
         kept: int,
         widths: tuple[int, int],
         outputs: int,
-        num_rows: int | None = None,
+        num_rows: int,
     ) -> None:
         super().__init__()
         self.phases, self._learned = config.phases(sensor), config.learned_phases()
-        self.sensor, self.num_rows = sensor, sensor.height if num_rows is None else num_rows
+        self.sensor, self.num_rows = sensor, num_rows
         kept = kept if features else 0
         self.features = nn.Conv2d(features, kept, 1) if features else nn.Identity()
         self.rows = self._rows(config)

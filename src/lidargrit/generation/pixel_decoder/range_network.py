@@ -38,9 +38,9 @@ class RangeNetwork(PhaseNetwork):
         config: PixelDecoderConfig,
         sensor: SensorModel,
         features: int,
-        decoded: int = 0,
-        gaps: bool = False,
-        num_rows: int | None = None,
+        decoded: int,
+        gaps: bool,
+        num_rows: int,
     ) -> None:
         phases = config.phases(sensor)
         suggest = RangeCandidates(sensor, phases, config.surface_components, config.gravity_components)
@@ -132,8 +132,8 @@ class RangeNetwork(PhaseNetwork):
         self,
         output: Float[Tensor, "P B O h w"],
         candidates: Float[Tensor, "P B K h w"],
-        decoded: Float[Tensor, "P B 3 D h w"] | None = None,
-        told: Bool[Tensor, "P B h w"] | None = None,
+        decoded: Float[Tensor, "P B 3 D h w"] | None,
+        told: Bool[Tensor, "P B h w"] | None,
     ) -> RangeMixture:
         """Return the distributions of the ranges of the pixels of phases of one lattice.
 
