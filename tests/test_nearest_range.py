@@ -81,7 +81,7 @@ def tokens_by_loop(image, config):
                     rays = [r for line in lines for r in line[right * wide : (right + 1) * wide]]
                     part = [r for r in rays if r > 0]
                     close = sum(r <= 1.07 * nearest for r in part)
-                    parts.append((close / len(part) if part else 0.0, close, len(part) <= 0.5 * len(rays)))
+                    parts.append((close / len(part) if part else 0.0, close, len(part) < 0.5 * len(rays)))
             most = max(range(len(parts)), key=lambda number: parts[number][0] + 1e-3 * parts[number][1])
             states = tuple(
                 "nearest" if number == most else "dropped" if drops else "nearest" if share >= 0.5 else "farther"

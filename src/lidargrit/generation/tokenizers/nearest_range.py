@@ -82,9 +82,9 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
     """Tokens name the nearest range of their cell, so that a pole keeps its token whatever stands behind it.
 
     A token is 0 for a cell without a return. Any other is 1 + level * patterns + pattern: the level of the nearest
-    range, and of each part of the cell whether it is dropped (at most half of its rays return), else nearest (at least
-    half of its returns lie within 7 % of that range), else farther. The part of whose returns the largest share lies
-    there is nearest in any case.
+    range, and of each part of the cell whether it is dropped (fewer than half of its rays return), else nearest (at
+    least half of its returns lie within 7 % of that range), else farther. The part of whose returns the largest share
+    lies there is nearest in any case. A part of two rays that lost one by chance is not dropped: that would be noise.
     Nothing of that is learned. What is learned is to decode: each pixel has a distribution of its range whose
     components begin at the nearest ranges of its own and of the eight cells around, and the probability of its return.
 
@@ -136,7 +136,7 @@ class NearestRangeTokenizer(Tokenizer[NearestRangeConfig]):
         most = F.one_hot((share + 1e-3 * number_close).argmax(-1), share.shape[-1]) > 0
         rays_of_a_part = config.cell_rows * config.cell_columns // share.shape[-1]
         state = torch.where(share >= 0.5, _NEAREST, _FARTHER)
-        state = torch.where(2 * number <= rays_of_a_part, _DROPPED, state).masked_fill(most, _NEAREST)
+        state = torch.where(2 * number < rays_of_a_part, _DROPPED, state).masked_fill(most, _NEAREST)
         digits = len(_STATES) ** torch.arange(share.shape[-1] - 1, -1, -1, device=state.device)
         pattern = torch.searchsorted((self.states * digits).sum(-1), (state * digits).sum(-1))
         level = ((nearest.log() - self._low) / (self._high - self._low) * config.levels).floor()
