@@ -80,9 +80,9 @@ def test_finds_each_of_our_sensors_in_simulated_scans(simulated):
     assert again.same_rays(with_field.sensor)
 
 
-def test_finds_each_of_our_sensors_without_the_ring_field(simulated):
+def test_finds_each_of_our_sensors_where_the_field_numbers_the_points(simulated):
     sensor, scans = simulated
-    fit = fit_sensor([Scan(scan.points_xyz_m) for scan in scans])
+    fit = fit_sensor([Scan(scan.points_xyz_m, ring=torch.arange(len(scan))) for scan in scans])
     near(fit, sensor, 0.05)
     if fit.method == "ring by ring":
         assert fit.counter_clockwise

@@ -118,7 +118,8 @@ def test_keeps_columns_of_any_type_and_name(ending, kind, tmp_path):
     again = form.read(path)
     assert np.array_equal(again.points_xyz_m.numpy(), points)
     if kind != "<i8":
-        assert np.array_equal(again.rows.columns["time"].astype(kind), times)
+        for name in ("time", "sensor_id"):
+            assert np.array_equal(again.rows.columns[name].astype(kind), times)
     elif ending == "csv":  # PLY has no whole numbers of 64 bits, and readers of text take doubles
         assert f",{times[1]}\n" in path.read_text()
 

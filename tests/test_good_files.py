@@ -125,7 +125,9 @@ def test_commas_within_quotation_marks_are_no_decimal_points(tmp_path):
     with pytest.raises(ScanError, match="with a decimal point"):
         read_scan(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text('x;y;z;note\n"1.5";2;"";"a"\n2;3;4;b\n"1.5";2;3;""\n')
-    assert len(read_scan(tmp_path / "a.csv", bad_points="drop")) == 2
+    scan = read_scan(tmp_path / "a.csv", bad_points="drop")
+    assert len(scan) == 2
+    assert "column 'note' left out: not numbers in all lines" in scan.notes
 
 
 def with_lists(lengths, order):

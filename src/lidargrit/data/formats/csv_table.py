@@ -4,10 +4,12 @@ import codecs
 import re
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64, Num
 
 from lidargrit.core.errors import ScanError, first_words
 from lidargrit.core.files import atomic_path
@@ -23,8 +25,10 @@ from lidargrit.data.formats.shared.columns import (
 from lidargrit.scans.columns import known_name
 from lidargrit.scans.types import Scan
 
+_AXES = {"x", "y", "z"}
 _FORMAT = "lines of numbers below a line that names the columns, x, y and z among them"
 _HEADER_BYTES = 4096
+_WHOLE_BELOW = 2.0**63
 _MARKS_OF_UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _SEPARATORS = (",", ";", "\t", " ")
 
@@ -33,7 +37,7 @@ class CsvTable(ColumnFormat):
     """Text with a first line of names, such as ``x,y,z,intensity``; separated by commas, semicolons, tabs or blanks.
 
     Names and numbers may stand in quotation marks, names in capitals, and "#" or "//" before the first of them. Numbers
-    have a decimal point. Columns of other names are left alone.
+    have a decimal point. Columns of other names go along where they hold numbers only; a note names the rest.
     """
 
     title = "table of text with a header (.csv)"
@@ -42,18 +46,16 @@ class CsvTable(ColumnFormat):
     @staticmethod
     def recognises(path: Path) -> bool:
         """Return whether the first line names x, y and z."""
-        return {"x", "y", "z"} <= {name.lower() for name in _names(_utf_8(first_bytes(path, _HEADER_BYTES)))[0]}
+        return {name.lower() for name in _names(_utf_8(first_bytes(path, _HEADER_BYTES)))[0]} >= _AXES
 
     @staticmethod
     def read(path: Path, index: int = 0, bad_points: BadPoints = "refuse") -> Scan:
         """Read the scan in a file."""
         data = _utf_8(read_bytes(path, BYTES_AT_MOST, _FORMAT))
         names, separator = _names(data[:_HEADER_BYTES])
-        wanted: dict[str, int] = {}
-        for number, name in enumerate(names):
-            if name.lower() in {"x", "y", "z"} or known_name(name):
-                wanted.setdefault(name, number)
-        if not {"x", "y", "z"} <= {name.lower() for name in wanted}:
+        named = {name: names.index(name) for name in names if name}  # of one name the first
+        wanted = {name: number for name, number in named.items() if name.lower() in _AXES or known_name(name)}
+        if not {name.lower() for name in wanted} >= _AXES:
             there = ", ".join(map(ascii, names[:8]))[:120] or "nothing"
             raise ScanError(
                 f"{path}, whose first line names {there}", _FORMAT, "put a line such as x,y,z,intensity before the rest"
@@ -62,35 +64,73 @@ class CsvTable(ColumnFormat):
         check_lines(body, path, _FORMAT)
         _check_fields(body, len(names), separator, path)
         body = _with_nan(_unquoted(plain_text(body), separator), len(names), separator)
-        try:
-            with warnings.catch_warnings(action="ignore"):  # of a table without lines: said below
-                table = np.loadtxt(
-                    BytesIO(body),
-                    np.float64,
-                    comments=None,
-                    delimiter=None if separator == " " else separator,
-                    usecols=list(wanted.values()),
-                    max_rows=POINTS_AT_MOST + 1,
-                    ndmin=2,
-                    encoding="latin1",
-                )
-        except Exception as error:  # whatever the text makes the parser stumble over
-            what = f"{path}, whose lines cannot be read ({first_words(error)})"
-            raise ScanError(what, _FORMAT, "give every line a number in each column, with a decimal point") from None
-        if not 1 <= len(table) <= POINTS_AT_MOST:
-            raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
-        return scan_of_columns(dict(zip(wanted, table.T, strict=True)), path, bad_points, names)
+        columns = _columns(body, named, wanted, separator, path)
+        scan = scan_of_columns(columns, path, bad_points, names)
+        words = [ascii(name) for name in named if name not in columns]
+        if not words:
+            return scan
+        what = f"{'column' if len(words) == 1 else 'columns'} {', '.join(words[:3])} left out: not numbers in all lines"
+        return replace(scan, notes=(*scan.notes, what))
 
     @classmethod
     def write_columns(cls, path: Path, columns: Mapping[str, np.ndarray]) -> None:
-        """Write columns to a new file, numbers with all their digits."""
+        """Write columns to a new file, numbers with as many digits as tell them from all others."""
         columns = in_one_word(columns)
-        digits = {"f2": "%.9g", "f4": "%.9g", "f8": "%.17g"}
-        form = [digits.get(of.dtype.str[1:], "%d") for of in columns.values()]
+        form = ["%d" if of.dtype.kind in "iub" else "%s" for of in columns.values()]
         # Not as doubles, which do not hold the nanoseconds of a clock.
         table = np.rec.fromarrays([*columns.values()], [(name, of.dtype) for name, of in columns.items()])
         with atomic_path(path) as temporary:
             np.savetxt(temporary, table, form, ",", header=",".join(columns), comments="", encoding="utf-8")
+
+
+def _columns(
+    body: bytes, named: dict[str, int], needed: dict[str, int], separator: str, path: Path
+) -> dict[str, Num[np.ndarray, "n"]]:
+    """Return the columns that hold numbers, or refuse a table in which one that is needed does not."""
+    first = body.lstrip(b"\r\n").partition(b"\n")[0].decode("latin1")
+    cells = first.split() if separator == " " else first.split(separator)
+    likely = {name: number for name, number in named.items() if number < len(cells) and _is_number(cells[number])}
+    refusal = ""
+    for chosen in (likely | needed, needed):  # in a later line there may be a word
+        try:
+            table = _table(body, list(chosen.values()), separator)
+        except Exception as error:  # whatever the text makes the parser stumble over
+            refusal = f"{path}, whose lines cannot be read ({first_words(error)})"
+            continue
+        if not 1 <= len(table) <= POINTS_AT_MOST:
+            raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
+        columns = dict(zip(chosen, table.T, strict=True))
+        return {name: values if name.lower() in _AXES else _whole(values) for name, values in columns.items()}
+    raise ScanError(refusal, _FORMAT, "give every line a number in each column, with a decimal point")
+
+
+def _whole(values: Float64[np.ndarray, "n"]) -> Num[np.ndarray, "n"]:
+    """Return whole numbers as such, so that what is added to a column of them is whole, too."""
+    if np.isfinite(values).all() and (np.abs(values) < _WHOLE_BELOW).all() and (values % 1 == 0).all():
+        return values.astype(np.int64)
+    return values
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _table(body: bytes, columns: list[int], separator: str) -> Float64[np.ndarray, "n k"]:
+    with warnings.catch_warnings(action="ignore"):  # of a table without lines: its caller says it
+        return np.loadtxt(
+            BytesIO(body),
+            np.float64,
+            comments=None,
+            delimiter=None if separator == " " else separator,
+            usecols=columns,
+            max_rows=POINTS_AT_MOST + 1,
+            ndmin=2,
+            encoding="latin1",
+        )
 
 
 def _utf_8(data: bytes) -> bytes:

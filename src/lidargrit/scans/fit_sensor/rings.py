@@ -20,6 +20,7 @@ _SEAMS_DEG = (0.0, 180.0, 90.0, -90.0)  # where sweeps are cut; at any other pla
 _STRAY_SHARE = 0.01  # a ring of fewer points than this share of a common one is a stray at the seam
 _SAME_COUNT_AT_LEAST = 0.8  # of the scans; the others lost a ring, or gained one
 _LASERS_AT_MOST = 256
+_RINGS_AT_MOST = 1024  # of a field; one of more values counts something else, such as points
 _SAME_ELEVATION = 0.1  # of the change in elevation to a point anywhere in the file
 
 
@@ -52,8 +53,8 @@ def recover_rings(scans: Sequence[Points]) -> Rings | None:
     Files of KITTI are sorted ring by ring; most drivers write column by column, all lasers of one firing after another
     (then places without a return must have been kept, for else lasers cannot be counted).
     """
-    if all(points.ring is not None for points in scans):
-        field = tuple(points.ring for points in scans if points.ring is not None)
+    field = tuple(points.ring for points in scans if points.ring is not None)
+    if len(field) == len(scans) and all(len(np.unique(rings)) <= _RINGS_AT_MOST for rings in field):
         columns = _column_by_column(scans)
         turning, start = _turning(scans, field)
         return Rings("ring field", field, tuple(range(len(scans))), turning, start, columns.lasers if columns else 0)
