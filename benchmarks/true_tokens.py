@@ -3,6 +3,7 @@
     python benchmarks/true_tokens.py RUN SCANS drawn -n 128 [--set range_temperature=0.2 ...]
     lidargrit evaluate drawn SCANS --sensor drawn/sensor.json --protocol objects -n 128
 
+Of labelled scans it prints how many poles and trunks still stand, and how much of vehicles' windows is open.
 What these draws lack, the first stage has lost; what the samples of the run lack besides, the transformer has.
 OUT is new: it gets a range image in metres (``.npy``, 0 where no return) for each scan, and their sensor.
 """
@@ -13,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from relay.upright_objects import kept_objects
+from relay.windows import kept_windows
 
 from lidargrit.core import reporting
 from lidargrit.data.prepared.config import DataConfig
@@ -20,6 +23,8 @@ from lidargrit.data.sources import open_source
 from lidargrit.generation.generator import load
 from lidargrit.generation.tokens import DecodingOfTokens, TokenGenerator
 from lidargrit.scans.types import RangeImage
+
+_LEAST_OF_POLES = 3  # pixels for 64 columns
 
 
 def main() -> None:
@@ -37,11 +42,18 @@ def main() -> None:
     images = open_source(options.scans).images(generator.sensor, DataConfig(max_scans=options.n))
     options.out.mkdir(parents=True)
     (options.out / "sensor.json").write_text(json.dumps(generator.sensor.to_json()))
+    drawn, truth = [], []
     with reporting.progress("drawing", len(images)) as progress:
         for index in range(len(images)):
-            drawn = draw(generator, images.batch([index]), sampling, seed=index)
-            np.save(options.out / f"{index:06d}.npy", torch.where(drawn.return_mask, drawn.range_m, 0.0)[0].numpy())
+            truth.append(images.batch([index]))
+            drawn.append(draw(generator, truth[-1], sampling, seed=index))
+            range_m = torch.where(drawn[-1].return_mask, drawn[-1].range_m, 0.0)[0]
+            np.save(options.out / f"{index:06d}.npy", range_m.numpy())
             progress.advance(1)
+    if truth[0].label is not None:
+        before, after = (RangeImage.cat(images) for images in (truth, drawn))
+        print("poles and trunks:", kept_objects(before, after, _LEAST_OF_POLES * generator.sensor.width // 64))
+        print("windows of vehicles:", kept_windows(before, after))
 
 
 @torch.no_grad()

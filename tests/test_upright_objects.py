@@ -1,4 +1,4 @@
-"""Poles and trunks that still stand in what is made of labelled images."""
+"""Poles, trunks and windows of vehicles that are still there in what is made of labelled images."""
 
 import sys
 from pathlib import Path
@@ -13,6 +13,7 @@ from lidargrit.scans.types import RangeImage
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks" / "relay"))
 
 from upright_objects import kept_objects, upright_objects
+from windows import kept_windows
 
 SENSOR = load_sensor("hdl64e_kitti_odometry").with_columns(64, 1)
 
@@ -50,3 +51,32 @@ def test_images_without_labels_are_refused():
     image = street([])
     with pytest.raises(ConfigError, match="without labels"):
         upright_objects(RangeImage(image.range_m, image.return_mask, SENSOR))
+
+
+def with_windows(*opened):
+    """Return a car 10 m away from column 20 to 39, whose rows 14 to 17 return nothing in some columns."""
+    image = street([(10, 20, 20, 20)])
+    for first, end in opened:
+        image.range_m[0, 14:18, first:end] = 0
+    return RangeImage.masked(image.range_m, image.range_m > 0, SENSOR, image.planes)
+
+
+@pytest.mark.parametrize(
+    ("made", "overlap", "half"),
+    [([(24, 34)], 1, 1), ([(24, 29)], 0.5, 1), ([(24, 28)], 0.4, 0), ([(22, 38)], 10 / 16, 1), ([], 0, 0)],
+)
+def test_windows_overlap_by_intersection_over_union(made, overlap, half):
+    found = kept_windows(with_windows((24, 34)), with_windows(*made))
+    assert found.overlap == pytest.approx(overlap)
+    assert (found.half, found.total) == (half, 1)
+    # Of 360 true pixels those are lost that are open beside the true window.
+    assert found.share_of_pixels == pytest.approx(1 - 4 * sum(max(0, 24 - a) + max(0, b - 34) for a, b in made) / 360)
+
+
+def test_a_hole_of_five_pixels_and_one_in_a_corner_are_no_windows():
+    image = with_windows()
+    image.return_mask[0, 14, 24:29] = False
+    image.return_mask[0, 10:14, 20:24] = False
+    assert kept_windows(image, image).total == 0
+    image.return_mask[0, 14, 29] = False
+    assert kept_windows(image, image).total == 1

@@ -11,7 +11,7 @@ from lidargrit.core.errors import ConfigError
 from lidargrit.scans.types import RangeImage
 
 _TRUNK, _POLE = 71, 80  # SemanticKITTI's numbers
-_LEAST_PIXELS = 40
+_LEAST_PIXELS = 40  # of 1024 columns
 _RELATIVE_ERROR, _LEAST_SHARE = 0.05, 0.6
 _TOUCHING = np.ones((3, 3))  # pixels that share a corner belong together
 
@@ -30,13 +30,11 @@ class Kept(NamedTuple):
     share_of_pixels: float
 
 
-def upright_objects(images: RangeImage) -> Int[np.ndarray, "B H W"]:
+def upright_objects(images: RangeImage, least_pixels: int = _LEAST_PIXELS) -> Int[np.ndarray, "B H W"]:
     """Number the poles and trunks of each image from 1; other pixels are 0.
 
-    An object is a connected set of at least 40 pixels labelled as pole or trunk that spans at least twice as many rows
-    as columns. One that lies across the first and the last column counts as two.
-
-
+    An object is a connected set of at least so many pixels labelled as pole or trunk that spans at least twice as many
+    rows as columns. One that lies across the first and the last column counts as two.
     """
     if images.label is None:
         raise ConfigError("range images without labels", "labelled ones, such as simulated streets", "give those")
@@ -48,20 +46,21 @@ def upright_objects(images: RangeImage) -> Int[np.ndarray, "B H W"]:
         count = 0
         for index, box in enumerate(ndimage.find_objects(components), 1):
             found = components[box] == index
-            if found.sum() >= _LEAST_PIXELS and found.any(1).sum() >= 2 * found.any(0).sum():
+            if found.sum() >= least_pixels and found.any(1).sum() >= 2 * found.any(0).sum():
                 count += 1
                 numbered[box][found] = count
     return numbers
 
 
-def kept_objects(truth: RangeImage, made: RangeImage) -> Kept:
+def kept_objects(truth: RangeImage, made: RangeImage, least_pixels: int = _LEAST_PIXELS) -> Kept:
     """Count the poles and trunks of labelled images that stand in reconstructions, or in samples from true tokens.
 
     Args:
         truth: batch of range images with labels.
         made: images made of them, of the same size and order; only their ranges and returns are read.
+        least_pixels: number of pixels of the smallest object that counts.
     """
-    numbers = upright_objects(truth)
+    numbers = upright_objects(truth, least_pixels)
     true_m, made_m = (images.range_m.cpu() for images in (truth, made))
     close = ((made_m - true_m).abs() <= _RELATIVE_ERROR * true_m) & made.return_mask.cpu()
     shares = [
