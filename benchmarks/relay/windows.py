@@ -33,10 +33,10 @@ class Windows(NamedTuple):
 
 
 def kept_windows(truth: RangeImage, made: RangeImage) -> Windows:
-    """Compare the drops between the highest and the lowest return of each column of each vehicle.
+    """Compare the windows of each vehicle: at least 6 connected drops between the ends of its columns.
 
-    A vehicle is a connected set of at least 40 labelled pixels, and has windows if at least 6 connected drops lie
-    within. One that lies across the first and the last column counts as two.
+    A vehicle is a connected set of at least 40 labelled pixels, and its columns end at its highest and lowest one. A
+    vehicle that lies across the first and the last column counts as two.
 
     Args:
         truth: batch of range images with labels.
@@ -49,10 +49,10 @@ def kept_windows(truth: RangeImage, made: RangeImage) -> Windows:
     true_drops, made_drops = (~images.return_mask.cpu().numpy() for images in (truth, made))
     close = (np.abs(made_m - true_m) <= _RELATIVE_ERROR * true_m) & ~made_drops
     overlaps = [
-        float((true & made)[outline].sum() / (true | made)[outline].sum())
+        float((before & _windows(made & outline)).sum() / (before | _windows(made & outline)).sum())
         for vehicle, true, made in zip(vehicles, true_drops, made_drops, strict=True)
         for outline in _outlines(vehicle)
-        if _has_windows(true & outline)
+        if (before := _windows(true & outline)).any()
     ]
     mean = float(np.mean(overlaps)) if overlaps else float("nan")
     share = float(close[vehicles].mean()) if vehicles.any() else float("nan")
@@ -70,6 +70,7 @@ def _below_first(pixels: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     return np.logical_or.accumulate(pixels, axis=0)
 
 
-def _has_windows(drops: Bool[np.ndarray, "H W"]) -> bool:
+def _windows(drops: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Return the drops that are connected with enough others; the rest are lost by chance."""
     numbered, _ = ndimage.label(drops, _TOUCHING)
-    return bool((np.bincount(numbered.ravel())[1:] >= _LEAST_WINDOW).any())
+    return drops & (np.bincount(numbered.ravel())[numbered] >= _LEAST_WINDOW)
