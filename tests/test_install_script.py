@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 SCRIPT = Path(__file__).parents[1] / "install.sh"
+OTHERS = "*config* | *compileall*"  # of what python is asked that installs nothing
 CPU = "--extra-index-url https://download.pytorch.org/whl/cpu"
 
 
@@ -40,7 +41,7 @@ def installed(folder, programs):
 )
 def test_machines_without_a_gpu_get_the_small_build(tmp_path, has_gpu, has_torch, answers, cpu_build, said):
     programs = {"nvidia-smi": ""} if has_gpu else {}
-    checks = f"*find_spec*) exit {int(not has_torch)};; *urlopen*) exit {int(not answers)};; *config* | *compileall*) exit 0;;"
+    checks = f"*find_spec*) exit {int(not has_torch)};; *urlopen*) exit {int(not answers)};; {OTHERS}) exit 0;;"
     done = installed(tmp_path, {**programs, "python": f'case "$*" in {checks} esac\necho "$@" > asked\n'})
     asked = (tmp_path / "asked").read_text()
     assert (CPU in asked) == cpu_build
@@ -53,7 +54,8 @@ def test_machines_without_a_gpu_get_the_small_build(tmp_path, has_gpu, has_torch
     ("uv_ends", "configured", "by"), [(0, "", "uv"), (2, "", "pip"), (0, "global.index-url='https://mirror'", "pip")]
 )
 def test_uv_installs_the_same_where_it_is_there_and_pip_has_no_settings_of_its_own(tmp_path, uv_ends, configured, by):
-    python = f'case "$*" in *find_spec*) exit 1;; *config*) echo "{configured}"; exit 0;; *urlopen* | *compileall*) exit 0;; esac\n'
+    checks = f'*find_spec*) exit 1;; *config*) echo "{configured}"; exit 0;; *urlopen* | {OTHERS}) exit 0;;'
+    python = f'case "$*" in {checks} esac\n'
     programs = {
         "python": python + 'echo "pip $@" >> asked\n',
         "uv": f'echo "uv $@" >> asked\nexit {uv_ends}\n',
