@@ -128,6 +128,10 @@ def test_commas_within_quotation_marks_are_no_decimal_points(tmp_path):
     scan = read_scan(tmp_path / "a.csv", bad_points="drop")
     assert len(scan) == 2
     assert "column 'note' left out: not numbers in all lines" in scan.notes
+    (tmp_path / "a.csv").write_text("x,y,z,note,gain\n1,2,3,,5\n2,3,4,b,6\n")
+    scan = read_scan(tmp_path / "a.csv")
+    assert scan.rows.columns["gain"].tolist() == [5, 6], "beside a column whose first line alone is no word"
+    assert "column 'note' left out: not numbers in all lines" in scan.notes
 
 
 def with_lists(lengths, order):

@@ -48,12 +48,12 @@ def kept_windows(truth: RangeImage, made: RangeImage) -> Windows:
     true_m, made_m = (images.range_m.cpu().numpy() for images in (truth, made))
     true_drops, made_drops = (~images.return_mask.cpu().numpy() for images in (truth, made))
     close = (np.abs(made_m - true_m) <= _RELATIVE_ERROR * true_m) & ~made_drops
-    overlaps = [
-        float((before & _windows(made & outline)).sum() / (before | _windows(made & outline)).sum())
+    pairs = [
+        (_windows(true & outline), _windows(made & outline))
         for vehicle, true, made in zip(vehicles, true_drops, made_drops, strict=True)
         for outline in _outlines(vehicle)
-        if (before := _windows(true & outline)).any()
     ]
+    overlaps = [float((before & after).sum() / (before | after).sum()) for before, after in pairs if before.any()]
     mean = float(np.mean(overlaps)) if overlaps else float("nan")
     share = float(close[vehicles].mean()) if vehicles.any() else float("nan")
     return Windows(mean, sum(overlap >= 0.5 for overlap in overlaps), len(overlaps), share)

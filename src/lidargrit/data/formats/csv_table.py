@@ -89,19 +89,19 @@ def _columns(
     """Return the columns that hold numbers, or refuse a table in which one that is needed does not."""
     first = body.lstrip(b"\r\n").partition(b"\n")[0].decode("latin1")
     cells = first.split() if separator == " " else first.split(separator)
-    likely = {name: number for name, number in named.items() if number < len(cells) and _is_number(cells[number])}
-    refusal = ""
-    for chosen in (likely | needed, needed):  # in a later line there may be a word
-        try:
-            table = _table(body, list(chosen.values()), separator)
-        except Exception as error:  # whatever the text makes the parser stumble over
-            refusal = f"{path}, whose lines cannot be read ({first_words(error)})"
-            continue
-        if not 1 <= len(table) <= POINTS_AT_MOST:
-            raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
-        columns = dict(zip(chosen, table.T, strict=True))
-        return {name: values if name.lower() in _AXES else _whole(values) for name, values in columns.items()}
-    raise ScanError(refusal, _FORMAT, "give every line a number in each column, with a decimal point")
+    others = [name for name in named if name not in needed and _is_number("".join(cells[named[name] :][:1]))]
+    table = _table(body, [named[name] for name in [*needed, *others]], separator)
+    if isinstance(table, Exception):  # a word in a later line of some column
+        others = [name for name in others if not isinstance(_table(body, [named[name]], separator), Exception)]
+        table = _table(body, [named[name] for name in [*needed, *others]], separator)
+    if isinstance(table, Exception):
+        what = f"{path}, whose lines cannot be read ({first_words(table)})"
+        raise ScanError(what, _FORMAT, "give every line a number in each column, with a decimal point")
+    if not 1 <= len(table) <= POINTS_AT_MOST:
+        raise ScanError(f"{len(table):,} lines in {path}", f"1 to {POINTS_AT_MOST:,}", "give one revolution a file")
+    read = dict(zip([*needed, *others], table.T, strict=True))
+    in_order = [name for name in named if name in read]
+    return {name: read[name] if name.lower() in _AXES else _whole(read[name]) for name in in_order}
 
 
 def _whole(values: Float64[np.ndarray, "n"]) -> Num[np.ndarray, "n"]:
@@ -119,18 +119,22 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _table(body: bytes, columns: list[int], separator: str) -> Float64[np.ndarray, "n k"]:
-    with warnings.catch_warnings(action="ignore"):  # of a table without lines: its caller says it
-        return np.loadtxt(
-            BytesIO(body),
-            np.float64,
-            comments=None,
-            delimiter=None if separator == " " else separator,
-            usecols=columns,
-            max_rows=POINTS_AT_MOST + 1,
-            ndmin=2,
-            encoding="latin1",
-        )
+def _table(body: bytes, columns: list[int], separator: str) -> Float64[np.ndarray, "n k"] | Exception:
+    """Return columns of numbers, or what the parser stumbled over."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of a table without lines: its caller says it
+            return np.loadtxt(
+                BytesIO(body),
+                np.float64,
+                comments=None,
+                delimiter=None if separator == " " else separator,
+                usecols=columns,
+                max_rows=POINTS_AT_MOST + 1,
+                ndmin=2,
+                encoding="latin1",
+            )
+    except Exception as error:  # whatever the text is
+        return error
 
 
 def _utf_8(data: bytes) -> bytes:
